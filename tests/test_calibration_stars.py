@@ -10,8 +10,8 @@ import pytest
 
 from psfdae.base.rng import stream
 from psfdae.image.stamps import cut, sky_around
-from psfdae.image.star_criteria import brightest_pixels, crowded, misfit, stamp_snr
-from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
+from psfdae.image.star_criteria import brightest_pixels, find_crowded, misfit, stamp_snr
+from psfdae.image.training_images import compute_bins, make_images, stack_parts, star_grid
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import find_centroids, shift_stamps
 from psfdae.stars.noise import NoiseModel, noise_equivalent_px
@@ -82,11 +82,11 @@ def test_area_of_a_star_follows_from_its_signal_to_noise():
 def test_only_a_bright_neighbour_crowds():
     position = np.array([[0.0, 0.0], [5.0, 0.0], [100.0, 0.0], [106.0, 0.0], [np.nan, 0.0]])
     brightness = np.array([100.0, 1.0, 100.0, 50.0, 1e6])
-    verdict = crowded(position, brightness, 10.0, 0.02)
+    verdict = find_crowded(position, brightness, 10.0, 0.02)
     assert verdict.tolist() == [False, True, True, True, False]
-    turned = crowded(position[::-1], brightness[::-1], 10.0, 0.02)
+    turned = find_crowded(position[::-1], brightness[::-1], 10.0, 0.02)
     assert turned[::-1].tolist() == verdict.tolist()
-    assert not crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
+    assert not find_crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
 
 
 def test_centres_are_found_to_a_hundredth_of_a_pixel():
@@ -127,7 +127,7 @@ def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
     assert len(np.unique(grid, axis=0)) == count
     is_held_out = held_out_fields(grid)
     assert is_held_out.mean() == pytest.approx(0.2, abs=0.05)
-    quarter = bins_of(position, 2)
+    quarter = compute_bins(position, 2)
     assert (np.bincount(quarter[is_held_out], minlength=4) > 0).all()
     order = np.random.default_rng(0).permutation(count)
     assert (star_grid(position[order]) == grid[order]).all()
@@ -143,7 +143,7 @@ def test_a_moved_star_is_the_star_rendered_there():
 
 def test_stacks_are_weighted_by_signal_to_noise():
     aligned = np.stack([np.full((4, 4), v) for v in (1.0, 4.0, 10.0)])
-    stacked = stacks(aligned, np.array([2.0, 1.0, 1.0]), np.array([0, 0, 2]), 4)
+    stacked = stack_parts(aligned, np.array([2.0, 1.0, 1.0]), np.array([0, 0, 2]), 4)
     assert stacked[:, 0, 0] == pytest.approx([2.0, 4.0, 10.0, 4.0])
 
 

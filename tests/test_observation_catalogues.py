@@ -226,12 +226,12 @@ def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, con
     path.write_text(content)
     observation = open_observation(image, D, catalogue=path)
     has_no_position = [False, True, True, True, False]
-    assert observation.without_position().tolist() == has_no_position
+    assert observation.lacks_position().tolist() == has_no_position
     assert f"{path}: no position in row 2, 3, 4: flagged" in observation.summary()
     stamps = next(observation.chunks(5))
     assert (
         (stamps.flags & StarFlag.TRUNCATED) > 0
-    ).tolist() == observation.without_position().tolist()
+    ).tolist() == observation.lacks_position().tolist()
     assert stamps.bad[1:4].all()
 
 

@@ -239,7 +239,7 @@ def test_origins(ramp, tmp_path, names, origin):
     stars = catalogue(tmp_path / "c.csv", [12], [9], names)
     assumed = {"X_IMAGE": 1, "xcentroid": 0, "x": None}[names[0]] if origin is None else origin
     if assumed is None:
-        with pytest.raises(ObservationError, match="origin of columns x,Y must be stated"):
+        with pytest.raises(ObservationError, match="origin of columns x,Y must be given"):
             open_observation(ramp, D, catalogue=stars, origin=origin)
         return
     observation = open_observation(ramp, D, catalogue=stars, origin=origin)

@@ -13,7 +13,7 @@ from psfdae.denoise import flux_model as module
 from psfdae.denoise.flux_model import FluxModel, robust_flux
 from psfdae.denoise.leading_modes import LeadingModes, compute_clipped_rms
 from psfdae.denoise.star_flux import Photometer
-from psfdae.image.stamps import StarFlag, border_pixels, cut, displacement, smoothed
+from psfdae.image.stamps import StarFlag, border_pixels, cut, displacement, smooth_stamps
 from psfdae.stars.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
@@ -258,8 +258,8 @@ def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():
     stamps = np.random.default_rng(0).normal(size=(40, 16, 16))
     kernel = np.outer([1, 2, 1], [1, 2, 1])[None] / 16
     expected = ndimage.convolve(stamps, kernel, mode="nearest")
-    assert smoothed(stamps) == pytest.approx(expected, abs=1e-12)
-    smooth = smoothed(np.random.default_rng(1).normal(size=(4000, 16, 16)))
+    assert smooth_stamps(stamps) == pytest.approx(expected, abs=1e-12)
+    smooth = smooth_stamps(np.random.default_rng(1).normal(size=(4000, 16, 16)))
     assert (smooth[:, 3, 3] - smooth[:, 9, 9]).std() == pytest.approx(np.sqrt(2) * 6 / 16, rel=0.05)
 
 

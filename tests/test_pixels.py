@@ -17,10 +17,10 @@ from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.interpolation import interpolated, interpolated_stamps
 from psfdae.image.opening import open_observation
-from psfdae.image.selection import Verdict, completed
+from psfdae.image.selection import Verdict, fill_bad_pixels
 from psfdae.image.sky_level import (
     SkyStructure,
-    _of_neighbours,
+    _smooth_meshes,
     noise_correlation,
     sky_level,
     sky_steps,
@@ -301,11 +301,11 @@ def test_a_mesh_far_from_the_plane_of_its_neighbours_takes_their_value():
     plane = 3.0 * row - 2.0 * column
     for excess in (0.0, 500.0):
         mesh = plane + excess * ((row == 2) & (column == 3))
-        assert _of_neighbours(mesh) == pytest.approx(plane)
+        assert _smooth_meshes(mesh) == pytest.approx(plane)
     # No direction is special.
     mesh = np.random.default_rng(7).normal(size=(6, 7))
     for turned in (lambda a: a[::-1], lambda a: a[:, ::-1], np.transpose):
-        assert _of_neighbours(turned(mesh)) == pytest.approx(turned(_of_neighbours(mesh)))
+        assert _smooth_meshes(turned(mesh)) == pytest.approx(turned(_smooth_meshes(mesh)))
 
 
 def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
@@ -470,7 +470,7 @@ def test_completed_stars_are_their_neighbours_scaled():
     zero = np.zeros((20, 2), int)
     position, nan = rng.uniform(0, 300, (20, 2)), np.full((20, 2), np.nan)
     facts = (position, flux, np.full(20, 5.0), flux / 30, np.arange(20), nan, nan[:, 0])
-    repaired, missing = completed(BrightStars(hurt, zero, shift, *facts, bad), 16, 3)
+    repaired, missing = fill_bad_pixels(BrightStars(hurt, zero, shift, *facts, bad), 16, 3)
     assert repaired.stamps[7, 16, 17] == pytest.approx(light[7, 16, 17], rel=0.02)
     part = shape[7, 16, 17] / shape[7, 8:24, 8:24].sum()
     assert missing[7] == pytest.approx(part, rel=0.03) and missing.sum() == missing[7]

@@ -275,7 +275,7 @@ def test_the_stars_say_the_origin_of_plain_columns(tmp_path, image, place):
 
 def test_where_they_do_not_the_origin_is_asked_for(image, place):
     for listed in (table(place + 0.5), table(place + np.array([0.0, 1.0])), table(place[:5])):
-        with pytest.raises(Error, match="origin= says it"):
+        with pytest.raises(Error, match="origin= sets it"):
             positions(image, listed)
 
 
@@ -289,7 +289,7 @@ def test_a_list_off_by_one_pixel_is_refused_whatever_the_noise(seed):
         ({"catalogue": table(place), "origin": 1}, 0),
     )
     for stated, is_accepted in cases[:: 1 if seed == 0 else 4]:
-        with pytest.raises(Error, match=f"origin={is_accepted} says so"):
+        with pytest.raises(Error, match=f"origin={is_accepted} sets this"):
             Stars.from_image(image, **stated, **CAMERA)
     accepted = Stars.from_image(image, catalogue=place + 1, accept_offset=True, **CAMERA)
     assert "x -1.00, y -1.00 px" in "".join(accepted.notes)

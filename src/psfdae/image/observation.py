@@ -6,7 +6,7 @@
 | image (h, w) and a catalogue | cut at the rounded position | of the catalogue |
 | image (h, w) to be searched | the same | of the stars found (`detection`) |
 
-Whatever is wrong with a file ends in one `ObservationError` of one line that names it.
+Faults of a file raise `ObservationError`, with one line that names the file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from psfdae.image.detector_frame import detector_frames
 from psfdae.image.errors import ObservationError, reading, shorten, silent
 from psfdae.image.fits_file import Card, Pixels, open_pixels, pixel_to_sky
 from psfdae.image.layers import Layers
-from psfdae.image.positions import repeated_rows
+from psfdae.image.positions import find_repeated_rows
 from psfdae.image.stamps import (
     Stamps,
     StarFlag,
@@ -42,18 +42,18 @@ from psfdae.stars.moments import robust_scatter
 
 
 class ListedStars(NamedTuple):
-    """Columns of n stars; NaN where a list has no number.
+    """Columns of n stars; NaN where the list gives no number.
 
     Attributes
     ----------
     id : ndarray, shape (n,), int64 or str
-        By the list, if it says any.
+        Identifiers from the list, or numbers from 0.
     row : ndarray of int, shape (n,)
         Row of the list.
     flux, background, colour : ndarray, shape (n,)
-        Flux inside the stamp, sky per pixel, and colour, of columns that are stated.
+        Flux inside the stamp, sky per pixel, and colour, from the columns that the user names.
     flags : ndarray, shape (n,), uint16
-        `StarFlag`s by the list.
+        `StarFlag`s from the list.
     """
 
     id: np.ndarray
@@ -70,7 +70,7 @@ class ListedStars(NamedTuple):
 
 @dataclass(frozen=True)
 class Observation:
-    """Stars of one FITS file. `ImageInput.open` makes it.
+    """Stars of one FITS file, returned by `ImageInput.open`.
 
     Attributes
     ----------
@@ -85,16 +85,17 @@ class Observation:
     positions : ndarray or None, shape (n, 2)
         0-based x and y; NaN where neither list nor WCS has one.
     stars : ListedStars
+        Columns of the stars, one value for each.
     header_cards : list of Card
-        Provenance, to be copied into what is made of the stars.
+        Provenance, copied into the products.
     catalogue : Path or None
         The star list.
     detections : Catalogue or None
-        The list that was made in its place.
+        The list of detected stars, used in place of a star list.
     colour_column : str or None
         Column of the star list with colours.
     remarks : tuple of str
-        Sentences on what is in the file or the list, and used or not.
+        Warnings about the file and the list: values that are used or ignored.
     noise_correlation : float
         Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
     neighbour_light : callable or None
@@ -120,14 +121,14 @@ class Observation:
     _layers: Layers
     neighbour_light: Callable[[slice, int, int], np.ndarray] | None = None
     assumed_scale_arcsec: ClassVar[float] = 1.0
-    """Scale of the pixels where nothing says it."""
+    """Pixel scale that is assumed if neither header nor user gives one."""
 
     def __repr__(self) -> str:
         return f"Observation({str(self.path)!r}, {self.count} stars)"
 
     @property
     def count(self) -> int:
-        """Number of stars; none is ever left out."""
+        """Number of stars, flagged ones included."""
         return len(self.stars.id)
 
     @property
@@ -154,7 +155,7 @@ class Observation:
 
     @property
     def unit(self) -> str:
-        """Unit of the image's pixels by its header; "" where that says none."""
+        """Unit of the image's pixels from its header; "" if the header gives none."""
         return self._layers.image.unit
 
     @property
@@ -164,26 +165,26 @@ class Observation:
 
     @property
     def scale_assumed(self) -> bool:
-        """True if nothing says the pixel scale."""
+        """True if neither header nor user gives the pixel scale."""
         return self.camera["pixel scale"].origin == "assumed"
 
-    def assuming(self) -> Observation:
-        """Return the same with `assumed_scale_arcsec` if nothing says the scale."""
+    def assume_scale(self) -> Observation:
+        """Return the observation with `assumed_scale_arcsec` if the scale is unknown."""
         if self.pixel_scale_arcsec is not None:
             return self
-        # The origin tells that it was assumed.
+        # The origin shows that the scale is an assumption.
         scale = CameraValue(self.assumed_scale_arcsec, "assumed")
         return replace(self, camera=self.camera | {"pixel scale": scale})
 
     @property
     def detector_frames(self) -> dict[str, list[float]]:
-        """Positions of its pixels on the detector, as far as the header gives them."""
+        """Positions of the image's pixels on the detector, if the header gives them."""
         return detector_frames(self._layers.image)
 
     def sky(self) -> Sky:
-        """Return the whole image with its sky; ObservationError if none can be measured.
+        """Return the whole image with its sky, in the unit of the image times `unit_factor`.
 
-        It is in the unit of the image times `unit_factor`, as is `to_sky_unit`.
+        Raises ObservationError if no sky can be measured.
         """
         return self._layers.sky()
 
@@ -193,13 +194,13 @@ class Observation:
         return self._layers.image.unit_factor
 
     def to_sky_unit(self) -> Observation:
-        """Return the same with gain and saturation for pixels in the unit of `sky`."""
+        """Return the observation with gain and saturation for pixels in the unit of `sky`."""
         gain = self.camera["gain"].times(1.0 / self.unit_factor)
         saturation = self.camera["saturation"].times(self.unit_factor)
         return replace(self, camera=self.camera | {"gain": gain, "saturation": saturation})
 
     def to_image_unit(self, values: np.ndarray) -> np.ndarray:
-        """Return values in the unit of the image; in double precision if the sky's is another."""
+        """Return values in the unit of the image, in double precision if the sky has another."""
         return values if self.unit_factor == 1.0 else values / np.float64(self.unit_factor)
 
     @property
@@ -240,14 +241,14 @@ class Observation:
         # Pixels of the image that are bad, and rows of the list without a position.
         if self.shape is not None and (notes := self._layers.bad_pixels.notes):
             lines.append(f"{self.path}: left out: {', '.join(notes)}")
-        if (no_position := self.without_position()).any():
+        if (no_position := self.lacks_position()).any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(no_position)])
             lines.append(
                 f"{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
             )
         return "\n".join(lines)
 
-    def without_position(self) -> np.ndarray:
+    def lacks_position(self) -> np.ndarray:
         """Return True for stars without a position in a list that has others, shape (n,).
 
         Detected stars all have one, and a cube need not have any.
@@ -256,14 +257,14 @@ class Observation:
             return np.zeros(self.count, dtype=bool)
         return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
-    def listed_again(self) -> np.ndarray:
+    def find_repeated_stars(self) -> np.ndarray:
         """Return True for stars of a list that are the same as an earlier one, shape (n,).
 
-        They are nearer to it than a tenth of a pixel (`repeated_rows`).
+        Their distance is less than a tenth of a pixel (`find_repeated_rows`).
         """
         if self.positions is None or self.detections is not None or self.shape is None:
             return np.zeros(self.count, dtype=bool)
-        return repeated_rows(self.positions)
+        return find_repeated_rows(self.positions)
 
     @cached_property
     def list_columns(self) -> Table | None:
@@ -271,12 +272,12 @@ class Observation:
         return None if self._list is None else self._list.columns(self.stars.row)
 
     def select(self, stars: np.ndarray) -> Observation:
-        """Return the same with some of the stars of the list, by a bool for each, shape (n,)."""
+        """Return the observation with the stars for which a mask of shape (n,) is True."""
         assert self.positions is not None
         return replace(self, positions=self.positions[stars], stars=self.stars.select(stars))
 
     def check_list(self) -> None:
-        """Refuse a star list of another image.
+        """Reject a star list of another image.
 
         Raises
         ------
@@ -285,17 +286,17 @@ class Observation:
         """
         if self.shape is None or self.catalogue is None or self.positions is None:
             return
-        # Positions on pixels of a source, of those that are known.
-        located = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        # Known positions that lie on pixels of a source.
+        indices = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
         sky = self._layers.sky()
         with silent():
             column, row = central_pixel(self.positions.T)
             # 2 σ above the sky is a source.
             hits = int(sky.covered(column, row, 2.0).sum())
-        if hits < 0.5 * located.size:
+        if hits < 0.5 * indices.size:
             raise ObservationError(
                 self.catalogue,
-                f"{hits} of {located.size} positions are on a source of {self.path}, at least half "
+                f"{hits} of {indices.size} positions are on a source of {self.path}, at least half "
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
 
@@ -305,7 +306,7 @@ class Observation:
         Raises
         ------
         ObservationError
-            If it is a time series of a field, and no list says that each plane is a star.
+            If it is a time series of a field, and no list gives a star for each plane.
         """
         if self.shape is not None or self._list is not None or self.count < 4:
             return
@@ -334,8 +335,8 @@ class Observation:
                 digest.update(values.astype(np.float32, copy=False).tobytes())
         return digest.hexdigest()
 
-    def with_margin(self, margin: int) -> Observation:
-        """Return the same with a margin in px of the stamps; those of a cube may have less."""
+    def replace_margin(self, margin: int) -> Observation:
+        """Return the observation with stamps of another margin in px; a cube limits it."""
         return replace(self, margin=margin if self.shape else min(margin, self.margin))
 
     def chunks(self, rows: int) -> Iterator[Stamps]:
@@ -350,9 +351,9 @@ class Observation:
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
                 if self.shape is None:
-                    yield _with_stars(self, part, *_cut_from_cube(self, part, pixels, mask))
+                    yield _build_stamps(self, part, *_cut_from_cube(self, part, pixels, mask))
                 else:
-                    yield _with_stars(self, part, *_cut_from_image(self, part, pixels, noise))
+                    yield _build_stamps(self, part, *_cut_from_image(self, part, pixels, noise))
 
 
 def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
@@ -363,7 +364,7 @@ def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
     """
     from scipy import ndimage
 
-    # Means of 3 × 3 pixels above the sky; their noise, and what nine of ten planes have at least.
+    # Means of 3 × 3 pixels above the sky, their noise, and their 10th percentile over the planes.
     smooth = ndimage.uniform_filter(np.nan_to_num(planes), (0, 3, 3))
     smooth -= np.median(smooth, axis=(1, 2), keepdims=True)
     noise = np.median(robust_scatter(smooth.reshape(len(planes), -1).T))
@@ -383,40 +384,41 @@ def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
 def _cut_from_cube(
     observation: Observation, part: slice, pixels: Pixels, mask: Pixels | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cut stamps out of the middle of those of a cube.
+    """Cut stamps out of the middle of the planes of a cube.
 
     Parameters
     ----------
     observation : Observation
+        The cube, with side and margin of the stamps.
     part : slice
         Stars that are cut.
     pixels, mask : Pixels
-        Of the cube, and of its mask if it has one.
+        Pixels of the cube, and of its mask if it has one.
 
     Returns
     -------
-    data, masked : ndarray, shape (n, s, s)
-        Pixels, and which of them the mask calls bad.
-    truncated : ndarray of bool, shape (n,)
-        Stars of which a part is off the image: none.
+    data, is_masked : ndarray, shape (n, s, s)
+        Pixels, and which of them are bad in the mask.
+    is_truncated : ndarray of bool, shape (n,)
+        Stars of which a part is off the image: always False.
     noise : ndarray, shape (n,)
         σ of the sky, NaN: it is to be estimated.
     """
 
-    def stamps_of(pixels: Pixels, rows: slice) -> np.ndarray:
+    def read_stamps(pixels: Pixels, rows: slice) -> np.ndarray:
         # A 2-d image counts as a cube of one stamp.
         is_cube = len(pixels.image.shape) == 3
         return cut(pixels[rows] if is_cube else pixels[slice(None)][None], side)
 
-    # The star of a larger stamp stands in its middle, too.
+    # The star is in the middle of a larger stamp, too.
     side, count = observation.stamp_px + 2 * observation.margin, part.stop - part.start
-    data = observation.to_image_unit(stamps_of(pixels, part))
-    masked = np.zeros(data.shape, dtype=bool)
+    data = observation.to_image_unit(read_stamps(pixels, part))
+    is_masked = np.zeros(data.shape, dtype=bool)
     if mask is not None:
         # All stamps may share one mask.
         mask_rows = part if len(mask.image.shape) == 3 else slice(0, 1)
-        masked |= observation._layers.is_bad(stamps_of(mask, mask_rows))
-    return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
+        is_masked |= observation._layers.is_bad(read_stamps(mask, mask_rows))
+    return data, is_masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
 
 def _cut_from_image(
@@ -427,99 +429,101 @@ def _cut_from_image(
     Parameters
     ----------
     observation : Observation
+        The image, with positions of stars, and side and margin of the stamps.
     part : slice
         Stars that are cut.
     pixels, noise : Pixels
-        Of the image, and of its map of noise if it has one.
+        Pixels of the image, and of its noise map if it has one.
 
     Returns
     -------
-    data, masked, truncated, noise
-        As `_cut_from_cube`; a noise of NaN cannot be measured.
+    data, is_masked, is_truncated, noise
+        As returned by `_cut_from_cube`; noise is NaN where it cannot be measured.
     """
     shape, layers, stamp_px = observation.shape, observation._layers, observation.stamp_px
     assert shape is not None and observation.positions is not None
     x, y = observation.positions[part].T
-    # The noise of the sky is that of a ring of at least 8 px around the stamp.
+    # The noise of the sky is measured in a ring of at least 8 px around the stamp.
     margin = max(observation.margin, 8)
-    # All layers are cut at the same places.
+    # All layers are cut at the same positions.
     window = (shape, x, y, stamp_px, margin)
-    data, inside, truncated = cut_image(pixels, *window)
+    data, inside, is_truncated = cut_image(pixels, *window)
     data = observation.to_image_unit(data)
     # Other stars of a crowded image are subtracted.
     raw = data
     if observation.neighbour_light is not None:
-        # Saturated pixels stay, or they would not be seen.
+        # Saturated pixels are not changed, so that they are flagged.
         full = np.inf if observation.saturate is None else observation.saturate
-        cleaned = data - observation.neighbour_light(part, stamp_px, margin)
-        data = np.where(data >= full, data, cleaned)
-    # Pixels off the image, of the mask, and those that show no sky.
-    masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
+        single_stars = data - observation.neighbour_light(part, stamp_px, margin)
+        data = np.where(data >= full, data, single_stars)
+    # Pixels that are off the image or masked.
+    is_masked = ~inside | (cut_image(layers.bad_pixels.mask, *window)[0] != 0)
     # The stamp with its own margin, within the wider window.
     stamp = slice(margin - observation.margin, margin + stamp_px + observation.margin)
     if noise is not None and layers.noise is not None:
-        # σ of the sky by the map, without the photons of the star.
+        # σ of the sky from the map, without the photons of the star.
         light: np.ndarray | float = 0.0
         if layers.noise.photons:
-            level, _ = sky_around(raw, masked, stamp_px)
+            level, _ = sky_around(raw, is_masked, stamp_px)
             light = (raw - level[:, None, None]) * observation.unit_factor
         sigma = layers.noise.sigma(cut_image(noise, *window)[0], light) / observation.unit_factor
-        stamp_sigma = np.ma.array(sigma, mask=masked)[:, stamp, stamp]
+        stamp_sigma = np.ma.array(sigma, mask=is_masked)[:, stamp, stamp]
         sky_noise = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
     else:
-        # In the stamp of a bright star, light that no PSF explains would pass for noise.
-        _, sky_noise = sky_around(data, masked | ~np.isfinite(data), stamp_px)
+        # Noise within the stamp of a bright star would include residuals of the PSF.
+        _, sky_noise = sky_around(data, is_masked | ~np.isfinite(data), stamp_px)
         least_noise = observation.least_noise
         sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, least_noise), np.nan)
-    return data[:, stamp, stamp], masked[:, stamp, stamp], truncated, sky_noise
+    return data[:, stamp, stamp], is_masked[:, stamp, stamp], is_truncated, sky_noise
 
 
-def _with_stars(
+def _build_stamps(
     observation: Observation,
     part: slice,
     data: np.ndarray,
-    masked: np.ndarray,
-    truncated: np.ndarray,
+    is_masked: np.ndarray,
+    is_truncated: np.ndarray,
     noise: np.ndarray,
 ) -> Stamps:
-    """Return stamps (n, s, s) of a part of the stars with all that is known of these.
+    """Return stamps (n, s, s) of some of the stars, with flags, positions and columns.
 
     Parameters
     ----------
     observation : Observation
+        The stars, with camera and bad pixels.
     part : slice
         Stars of the stamps.
     data : ndarray, shape (n, s, s)
         Counts, changed here: pixels without a number become 0.
-    masked : ndarray of bool, shape (n, s, s)
-        Pixels that do not count, to which those without a number are added.
-    truncated : ndarray of bool, shape (n,)
+    is_masked : ndarray of bool, shape (n, s, s)
+        Pixels that are ignored; pixels without a number are added here.
+    is_truncated : ndarray of bool, shape (n,)
         Stars of which a part is off the image.
     noise : ndarray, shape (n,)
         σ of the sky, NaN where it is to be estimated.
     """
     # A pixel of +inf is saturated, one of NaN is not.
     level = observation.saturate
-    saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
+    is_saturated = np.zeros(data.shape, dtype=bool) if level is None else data >= level
     # Pixels without a number are masked, and 0.
     finite = np.isfinite(data)
     if not finite.all():
         data[~finite] = 0.0
-        masked |= ~finite
+        is_masked |= ~finite
     # Positions in the image; and in an image, centres from the middle of the central pixel.
     unknown, stars = np.full(len(data), np.nan), observation.stars.select(part)
     x, y = (unknown, unknown) if observation.positions is None else observation.positions[part].T
-    listed = np.full((len(data), 2), np.nan)
-    raise_flag(stars.flags, StarFlag.TRUNCATED, truncated)
+    centre = np.full((len(data), 2), np.nan)
+    raise_flag(stars.flags, StarFlag.TRUNCATED, is_truncated)
     if observation.shape is not None:
-        listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-        # A cosmic ray within a pixel of the position: it may be no star.
+        centre = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
+        # A cosmic ray within a pixel of the position: the source may not be a star.
         cosmic = cut_image(observation._layers.bad_pixels.cosmic, observation.shape, x, y, 3, 0)[0]
         raise_flag(stars.flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
     return Stamps(
         data,
-        bad=masked,
-        saturated=saturated,
+        bad=is_masked,
+        saturated=is_saturated,
         flags=stars.flags,
         id=stars.id,
         x=x,
@@ -531,5 +535,5 @@ def _with_stars(
         gain=unknown if observation.gain is None else np.full(len(data), observation.gain),
         magnitude=unknown,
         colour=stars.colour,
-        listed=listed,
+        listed=centre,
     )

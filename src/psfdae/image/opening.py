@@ -1,10 +1,10 @@
-"""Opening of an observation: an image, its list and what is stated of them become `Observation`.
+"""Opening of an observation from an image, its star list and the user's options.
 
-In: `ImageInput`, the statements on an image. Out: the observation, with the camera checked against
-the pixels, mask and map of noise, and the stars of the list, or those found, at their positions.
-Pixels are read to find stars, and where there is a map of noise; stamps are cut later.
+Input: `ImageInput`, the options. Output: `Observation`, with a camera that is checked against the
+pixels, the mask and the noise map, and listed or detected stars at their positions. Pixels are read
+to find stars, and where there is a noise map; stamps are cut later.
 
-Whatever is wrong with a file ends in one `ObservationError` of one line that names it.
+Faults of a file raise `ObservationError`, with one line that names the file.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from psfdae.image.layers import Layers, find_layers, with_photons
 from psfdae.image.observation import ListedStars, Observation
 from psfdae.image.positions import (
     SAME_STAR_PX,
-    on_image,
+    add_origin,
+    find_repeated_rows,
+    is_on_image,
     positions_in_image,
-    repeated_rows,
-    with_origin,
 )
 from psfdae.image.stamps import StarFlag, raise_flag
 
 
 def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Observation:
-    """Return the stars of an image, with all that its file, its list and the user say of them.
+    """Open an image and its star list as an observation.
 
-    Pixels are read to find stars, and where there is a map of noise.
+    Pixels are read to find stars, and where there is a noise map.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
     stamp_px : int
         Side of the stamps.
     margin : int
-        Pixels around each stamp; those of a cube get as many of these as they have.
+        Pixels around each stamp; the stamps of a cube limit it.
 
     Raises
     ------
@@ -66,23 +66,23 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
     if margin < 0:
         raise ObservationError(source.path, f"margin {margin}, expected at least 0 pixels")
     if source.bad_bits is not None and not 0 < source.bad_bits < 2**63:
-        typed = keyword("bad_bits", source.bad_bits)
-        raise ObservationError(source.path, f"{typed}: expected 1 to 2**63 - 1")
+        option_text = keyword("bad_bits", source.bad_bits)
+        raise ObservationError(source.path, f"{option_text}: expected 1 to 2**63 - 1")
     # The image, and whether it is a cube of stamps.
     image = find_image(source.image, source.extension)
-    stated_camera = source.camera(image.unit)
+    user_camera = source.camera(image.unit)
     table = None if source.catalogue is None else as_catalogue(source.catalogue)
     image, is_cube = image_or_cube(source, image, table, stamp_px)
     # The camera: values of a header are used as far as the pixels do not contradict them.
-    camera, remarks = camera_values(image, stated_camera), unread_card_remarks(image)
+    camera, remarks = camera_values(image, user_camera), unread_card_remarks(image)
     noise_correlation = 1.0
     if not is_cube:
         camera, camera_remarks, noise_correlation = checked_camera(image, camera)
         remarks += [*camera_remarks, *sky_coordinate_remarks(image)]
     # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
     image = image.to_noise_unit()
-    # Mask and map of noise. The map is scaled to the scatter of the sky, above which stars are
-    # searched.
+    # Mask and noise map. The map is scaled to the scatter of the sky, in which stars are
+    # detected.
     layers, layer_remarks = find_layers(source, image, is_cube, camera)
     remarks += layer_remarks
     detections, threshold = None, source.detection_sigma
@@ -122,22 +122,25 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
 def image_or_cube(
     source: ImageInput, image: ImageFile, table: Catalogue | None, stamp_px: int
 ) -> tuple[ImageFile, bool]:
-    """Tell an image, out of which stars are cut, from a cube of stamps, or one stamp.
+    """Distinguish an image, out of which stars are cut, from a cube of stamps or one stamp.
 
     Parameters
     ----------
     source : ImageInput
+        Options, of which the detection threshold and the origin are used.
     image : ImageFile
+        The plane or cube of the file.
     table : Catalogue or None
         Star list, if there is one.
     stamp_px : int
-        Least side of stamps.
+        Minimum side of stamps.
 
     Returns
     -------
     image : ImageFile
         An image is a plane, even if its file has it as a cube with one.
     is_cube : bool
+        True for a cube of stamps, or one stamp.
 
     Raises
     ------
@@ -147,14 +150,14 @@ def image_or_cube(
     """
     # A threshold means that the stars are to be found.
     is_searched = source.detection_sigma is not None
-    # A cube with one plane is an image, if it is no stamp of the only star of a list.
+    # A cube with one plane is an image, unless it is the stamp of the only star of a list.
     if len(image.shape) == 3 and image.shape[0] == 1:
         has_stars = is_searched or (table is not None and len(table) != 1)
         if has_stars or max(image.shape) > LARGEST_STAMP_PX:
             image = image.one_plane()
     refuse_colours(image)
     shape, size = image.shape, "×".join(map(str, image.shape[-2:]))
-    # A plane is an image if it has stars, and else one stamp; stamps are squares of the right size.
+    # A plane is an image if it has a list or is searched, else one stamp; stamps are squares.
     is_image = len(shape) == 2 and (table is not None or is_searched)
     is_square = shape[-2] == shape[-1] >= stamp_px
     if not is_image and not (is_square and (len(shape) == 3 or shape[-1] == stamp_px)):
@@ -187,12 +190,12 @@ def detect_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.
     threshold : float
         In σ of the slightly smoothed image.
     unit_factor : float
-        Factor from the unit of the list to that of the sky.
+        Factor from the unit of the list to the unit of the sky.
 
     Raises
     ------
     ObservationError
-        If there is none.
+        If no star is found.
     """
     from astropy.table import Table
 
@@ -217,46 +220,49 @@ def locate_stars(
     Parameters
     ----------
     source : ImageInput
+        Options, of which the origin and the columns of the list are used.
     image : ImageFile
+        Image or cube, with the WCS.
     table : Catalogue or None
         Star list, or the stars that were found in the image.
     layers : Layers
-        The image with its sky, which shows the origin of a list that does not say it.
+        The image with its sky, from which an unknown origin of the list is estimated.
     is_cube : bool
         The image is a cube of stamps.
 
     Returns
     -------
     stars : ListedStars
+        Columns of the list.
     positions : ndarray or None, shape (n, 2)
-        None for a cube whose list has no pixels.
+        0-based x and y; None for a cube without a list of pixel positions.
     remarks : list of str
         Sentences on the list's origin, and on rows of the same star.
 
     Raises
     ------
     ObservationError
-        If the list does not fit the image, or a column that is stated is missing.
+        If the list does not fit the image, or a column that the user names is missing.
     """
-    # Without a list, stars are numbered and have no place.
+    # Without a list, stars are numbered and their positions are unknown.
     remarks: list[str] = []
     positions = None
     count = len(table) if table is not None else image.shape[0] if len(image.shape) == 3 else 1
     identifiers = np.arange(count, dtype=np.int64)
     flags = np.zeros(count, dtype=np.uint16)
     if table is not None:
-        # Position columns of the list, with the origin of pixels that is stated, or by custom.
+        # Position columns of the list, with the pixel origin that the user gives, or by custom.
         columns = table.positions()
         if source.origin is not None:
             columns = replace(columns, origin=source.origin)
-        # Where neither the user nor the list says the origin of its pixels, the stars show it.
+        # If neither the user nor the list gives the pixel origin, estimate it from the stars.
         if columns.origin is None and not (columns.sky or is_cube):
-            columns, remarks = with_origin(table, columns, layers)
+            columns, remarks = add_origin(table, columns, layers)
         positions = positions_in_image(image, table, columns, is_cube)
         identifiers, flags = table.identifiers(), table.flags(columns)
-        # Rows of a star that is listed already have no light of their own.
+        # Rows that repeat a star of an earlier row are flagged.
         if positions is not None and not is_cube and source.detection_sigma is None:
-            is_repeated = repeated_rows(positions)
+            is_repeated = find_repeated_rows(positions)
             raise_flag(flags, StarFlag.BLENDED, is_repeated)
             if rows := [str(row + 1) for row in np.flatnonzero(is_repeated)]:
                 subject = "row is" if len(rows) == 1 else "rows are"
@@ -264,7 +270,7 @@ def locate_stars(
                     f"{table.path}: {len(rows)} {subject} within {SAME_STAR_PX:g} px of an earlier "
                     f"one ({shorten(rows)}): flagged BLENDED, and not learnt from"
                 )
-    # Columns that are stated; NaN where a list has no number, or none is stated.
+    # Columns that the user names; NaN where the list gives no number, or without a name.
     numbers = [np.full(count, np.nan) for _ in range(3)]
     for k, name in enumerate((source.flux_column, source.background_column, source.colour_column)):
         if name is not None and table is None:
@@ -275,6 +281,6 @@ def locate_stars(
     # A list may cover a larger part of the sky than the image.
     if source.on_image and positions is not None and not is_cube:
         # Rows keep their numbers in the list.
-        selected = on_image(positions, image.shape)
-        stars, positions = stars.select(selected), positions[selected]
+        is_selected = is_on_image(positions, image.shape)
+        stars, positions = stars.select(is_selected), positions[is_selected]
     return stars, positions, remarks

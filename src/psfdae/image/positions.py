@@ -1,7 +1,7 @@
 """Positions of the stars of a list in an image: from its pixels or its sky coordinates, checked.
 
-A star list and an image go in; 0-based positions (n, 2), x and y, come out, NaN for stars that no
-pixel of the plane of the image shows.
+Inputs: a star list and an image. Output: 0-based positions (n, 2), x and y, NaN for stars that are
+not in the plane of the image.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def positions_in_image(
     Parameters
     ----------
     image : ImageFile
+        Image or cube, with the WCS.
     table : Catalogue
+        The star list.
     columns : Positions
         Columns of the list, and the origin of its pixels.
     is_cube : bool
@@ -42,13 +44,13 @@ def positions_in_image(
     Returns
     -------
     ndarray or None, shape (n, 2)
-        None for a cube with a list on the sky.
+        0-based x and y; None for a cube with a list of sky coordinates.
 
     Raises
     ------
     ObservationError
-        If the list has no star on the image, more than pixels, another number than the cube has
-        stamps, or pixels of an unknown origin; or if a WCS is missing.
+        If the list has no star on the image, more stars than pixels, another number of stars than
+        the cube has stamps, or pixels of an unknown origin; or if a WCS is missing.
     """
     if is_cube and len(table) != image.shape[0]:
         raise ObservationError(
@@ -71,34 +73,32 @@ def positions_in_image(
         if columns.origin is None:
             raise ObservationError(
                 table.path,
-                f"the origin of columns {names} must be stated: is the centre of the first pixel "
-                f"0 or 1? {keyword('origin')} says it",
+                f"the origin of columns {names} must be given: is the centre of the first pixel "
+                f"0 or 1? {keyword('origin')} sets it",
             )
-        listed = [table.pixels(name) for name in (columns.first, columns.second)]
-        positions = np.stack(listed, axis=1) - columns.origin
-    # What is beyond any image is no position: its squares would not even be numbers.
+        list_pixels = [table.pixels(name) for name in (columns.first, columns.second)]
+        positions = np.stack(list_pixels, axis=1) - columns.origin
+    # Values far outside any image are not positions, and their squares overflow.
     positions = np.where(np.abs(positions) < LARGEST_POSITION_PX, positions, np.nan)
     if not is_cube:
         check_overlap(image, table, columns, positions)
     return positions
 
 
-def with_origin(
-    table: Catalogue, columns: Positions, layers: Layers
-) -> tuple[Positions, list[str]]:
+def add_origin(table: Catalogue, columns: Positions, layers: Layers) -> tuple[Positions, list[str]]:
     """Return the columns of a list with the origin that the stars of an image show.
 
     Returns
     -------
     columns : Positions
-        Unchanged if the stars do not show it clearly, or the image has no sky.
+        Unchanged if the stars do not show it clearly, or no sky can be measured.
     remarks : list of str
-        A sentence on the origin.
+        A sentence on the origin that was found.
     """
-    # Centroids of the stars differ from the listed pixels by the origin.
-    listed = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
+    # Centroids of the stars differ from the pixels of the list by the origin.
+    list_pixels = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
     try:
-        data_origin = origin_of(layers.sky(), listed)
+        data_origin = origin_of(layers.sky(), list_pixels)
     except ObservationError:  # no sky can be measured
         data_origin = None
     if data_origin is None:
@@ -112,7 +112,7 @@ def with_origin(
     return replace(columns, origin=origin), [sentence]
 
 
-def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def is_on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return True for positions (n, 2), x and y, on an image (rows, columns)."""
     # Row and column of the pixel that a star is in.
     pixel = central_pixel(positions[:, ::-1])
@@ -122,21 +122,23 @@ def on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def check_overlap(
     image: ImageFile, table: Catalogue, columns: Positions, positions: np.ndarray
 ) -> None:
-    """Refuse a list without a star on the image, or with more there than the image has pixels.
+    """Reject a list without a star on the image, or with more stars there than pixels.
 
     Parameters
     ----------
     image : ImageFile
+        Image of two dimensions.
     table : Catalogue
+        The star list, named in messages.
     columns : Positions
         Columns of the list, named in messages.
     positions : ndarray, shape (n, 2)
         0-based x and y, NaN where unknown.
     """
-    # A list with more stars than pixels is not one of this image.
+    # A list with more stars than pixels belongs to another image.
     height, width = image.shape
     size = f"{image.path} of {width} columns and {height} rows"
-    count = np.count_nonzero(on_image(positions, image.shape))
+    count = np.count_nonzero(is_on_image(positions, image.shape))
     if count > height * width:
         raise ObservationError(
             table.path, f"{count} stars are on the image {size}, more than it has pixels"
@@ -145,9 +147,9 @@ def check_overlap(
         return
     # The range of the positions shows a wrong unit, or another image.
     ranges = "nowhere in its projection"
-    located = positions[np.isfinite(positions).all(axis=1)]
-    if len(located):
-        (x0, y0), (x1, y1) = located.min(axis=0), located.max(axis=0)
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    if len(finite):
+        (x0, y0), (x1, y1) = finite.min(axis=0), finite.max(axis=0)
         ranges = f"at x {x0:.6g} … {x1:.6g}, y {y0:.6g} … {y1:.6g}"
     if columns.sky:
         ranges += f" ({columns.first},{columns.second} without a unit are degrees)"
@@ -156,39 +158,40 @@ def check_overlap(
     )
 
 
-def repeated_rows(positions: np.ndarray) -> np.ndarray:
+def find_repeated_rows(positions: np.ndarray) -> np.ndarray:
     """Return True for positions (n, 2) within `SAME_STAR_PX` of an earlier one, shape (n,)."""
     from scipy.spatial import cKDTree
 
-    located = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    indices = np.flatnonzero(np.isfinite(positions).all(axis=1))
     is_repeated = np.zeros(len(positions), dtype=bool)
-    # Of each pair of rows at one place, the later one is a repetition.
-    pairs = cKDTree(positions[located]).query_pairs(SAME_STAR_PX, output_type="ndarray")
-    is_repeated[located[pairs.max(axis=1)]] = True
+    # Of each pair of rows at one position, the later one is a repetition.
+    pairs = cKDTree(positions[indices]).query_pairs(SAME_STAR_PX, output_type="ndarray")
+    is_repeated[indices[pairs.max(axis=1)]] = True
     return is_repeated
 
 
 def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
-    """Return a sentence on how far stars are off the positions of their list.
+    """Check how far stars are off the positions of their list; return a sentence on it.
 
     Parameters
     ----------
     path : Path or None
         The list.
     off : ndarray, shape (n, 2)
-        Position of each star less that of the list, x and y in px; NaN where unknown.
+        Position of each star less its position in the list, x and y in px; NaN where unknown.
     accept : bool
-        Take the list whatever the offset is.
+        Accept the list whatever the offset is.
 
     Returns
     -------
     str or None
-        None if fewer than five are known, or without a list.
+        None if fewer than five offsets are known, or without a list.
 
     Raises
     ------
     ObservationError
-        If half of the stars are off by more than 1 px along an axis, or all by 1 px along both.
+        If half of the stars are off by more than 1 px along an axis, or the median offset is 1 px
+        along both.
     """
     offsets = off[~np.isnan(off).any(axis=1)]
     if path is None or len(offsets) < 5:
@@ -202,21 +205,21 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
     )
     if accept:
         return f"{path}: {sentence}"
-    # A list whose pixels count from the other origin is off by one pixel along both axes.
+    # A list with the other pixel origin is off by one pixel along both axes.
     x1, y1 = round(x), round(y)
     if x1 == y1 and abs(x1) == 1 and max(abs(x - x1), abs(y - y1)) < TOLERANCE_PX:
         origin = int(x1 < 0)
         raise ObservationError(
             path,
-            f"{sentence}: its positions count from {origin}? {keyword('origin', origin)} says so "
-            f"({keyword('accept_offset', True)} takes it as it is)",
+            f"{sentence}: its positions count from {origin}? {keyword('origin', origin)} sets this "
+            f"({keyword('accept_offset', True)} accepts it unchanged)",
         )
-    # Half of the stars more than 1 px off: the list belongs to something else.
+    # Half of the stars are more than 1 px off: the list belongs to another image.
     if (distance > 1.0).any():
         raise ObservationError(
             path,
             f"{sentence}: a list of another image or origin, or x and y exchanged? "
-            f"{keyword('accept_offset', True)} takes it as it is",
+            f"{keyword('accept_offset', True)} accepts it unchanged",
         )
     return f"{path}: {sentence}"
 
@@ -233,15 +236,16 @@ def sky_to_pixel(
     Parameters
     ----------
     wcs : WCS
+        Celestial WCS of the image, with its distortions.
     ra, dec : ndarray, shape (n,)
-        Degrees.
+        Right ascension and declination in degrees.
     shape : tuple of int
         Rows and columns of the image.
 
     Returns
     -------
     x, y : ndarray, shape (n,)
-        0-based; NaN for stars that the projection cannot show.
+        0-based pixels; NaN for stars outside the projection.
     """
     from astropy.coordinates import SkyCoord
     from astropy.wcs import NoConvergence
@@ -257,7 +261,7 @@ def sky_to_pixel(
     if wcs.has_distortion and is_near.any():
         try:
             x[is_near], y[is_near] = wcs.all_world2pix(*world[:, is_near], 0)
-        # Where the iteration does not end, its last step counts, unless it runs away.
+        # Where the iteration does not converge, use its last step, unless it diverges.
         except NoConvergence as error:
             solution = np.array(error.best_solution, dtype=np.float64)
             if error.divergent is not None:

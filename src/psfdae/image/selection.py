@@ -1,7 +1,7 @@
-"""Choice of the stars of an image that are good enough to learn the PSF from.
+"""Choice of the stars of an image that are good enough to train a PSF model on.
 
-In: an observation (`observation`), of which stamps somewhat wider than those of the method are
-read. Out: `Candidates`, with a verdict on each star and the stamps of the good ones.
+Input: an observation (`observation`), with stamps somewhat wider than the method's. Output:
+`Candidates`, with a verdict on each star and the stamps of the good ones.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image, sky_around
 from psfdae.image.star_criteria import (
     brightest_pixels,
-    crowded,
+    find_crowded,
+    find_pile_up,
     misfit,
-    piled_up,
     sharper_than_stars,
     stamp_snr,
     wider_than_stars,
@@ -35,7 +35,7 @@ from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, shift_stamps
 
 
 class CalibrationStarsError(Error, ValueError):
-    """An image has too few stars to learn from, or its settings contradict each other."""
+    """An image has too few training stars, or its settings contradict each other."""
 
 
 class Verdict(StrEnum):
@@ -61,7 +61,7 @@ class Candidates:
     Attributes
     ----------
     id : ndarray, shape (n,)
-        Names of the stars.
+        Identifiers of the stars.
     position : ndarray, shape (n, 2)
         (x, y) in the image, NaN where unknown.
     snr : ndarray, shape (n,)
@@ -69,13 +69,13 @@ class Candidates:
     noise, sky : ndarray, shape (n,)
         RMS and level of the sky in counts per pixel.
     brightest : ndarray, shape (n,)
-        Pixel of the star in counts, sky included; -inf for a star off the centre.
+        Brightest pixel of the star in counts, sky included; -inf for a star off the centre.
     highest : ndarray, shape (n,)
         Highest pixel of the stamp in counts; -inf if none can be used.
     verdict : ndarray of str, shape (n,)
         A `Verdict` for every star.
     bright : BrightStars
-        The good ones.
+        The stars whose verdict is good.
     """
 
     id: np.ndarray
@@ -92,12 +92,12 @@ class Candidates:
         return f"Candidates({self.count()})"
 
     @classmethod
-    def joined(cls, several: Sequence[Candidates]) -> Candidates:
-        """Return those of several observations, one after the other.
+    def concatenate(cls, several: Sequence[Candidates]) -> Candidates:
+        """Join the candidates of several observations, one after the other.
 
-        Rows of bright stars are shifted to those of the joined list.
+        Rows of bright stars are shifted to rows of the joined list.
         """
-        # Rows of bright stars count in the joined list.
+        # Rows of bright stars are rows of the joined list.
         starts = accumulate((len(candidates.verdict) for candidates in several), initial=0)
         bright = [stars.bright for stars in several]
         bright = [replace(b, row=b.row + n) for b, n in zip(bright, starts, strict=False)]
@@ -106,30 +106,30 @@ class Candidates:
         return cls(**columns, bright=BrightStars.concatenate(bright))
 
     def require(self, path: Path, stars_min: int, remarks: Sequence[str] = ()) -> None:
-        """Refuse an image with fewer good stars, by CalibrationStarsError.
+        """Raise CalibrationStarsError if the image has fewer good stars.
 
-        `remarks` are sentences on a mask or header values that were used or not, which may be why.
+        `remarks` are warnings about the mask or the header, which may give the reason.
         """
         if len(self.bright) < stars_min:
             problem = (
-                f"{path}: {len(self.bright)} stars are good enough to learn from, "
+                f"{path}: {len(self.bright)} stars are good enough for training, "
                 f"{stars_min} are needed (of {len(self.verdict)}: {self.count()}); "
                 f"{keyword('stars_min')} takes fewer, {keyword('snr_min')} fainter ones"
             )
             raise CalibrationStarsError("; ".join([problem, *remarks]))
 
     def count(self) -> str:
-        """Return how many stars there are of every verdict, in words."""
+        """Return the number of stars of every verdict, in words."""
         counts = Counter(self.verdict.tolist())
         return ", ".join(f"{counts[name]} {name}" for name in map(str, Verdict) if counts[name])
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
-        """Return columns of every star of the list, and which good ones are held out, (n,) each.
+        """Return columns of all stars of the list, with the part of the good ones, (n,) each.
 
         Parameters
         ----------
         held_out : ndarray of bool, shape (k,)
-            True for bright stars that no fit learns from.
+            True for bright stars that are kept out of all fits.
         """
         # Stars that are not good are in no part.
         part = np.full(len(self.verdict), "", dtype="<U8")
@@ -147,25 +147,26 @@ def collect(
     isolation_px: float | None = None,
     by_core: bool = False,
 ) -> Candidates:
-    """Measure all stars and choose those that are good enough to learn from.
+    """Measure all stars and choose those that are good enough for training.
 
     Parameters
     ----------
     observation : Observation
-        With stamps with a margin (a cube: its own, larger ones), of which only those of bright
-        stars are kept in memory.
+        The stars; stamps need a margin, and only stamps of bright stars are kept in memory.
     settings : CalibrationStars
+        Limits of the criteria.
     framing : Stamp
+        Side and jitter of the stamps of the method.
     isolation_px : float, optional
-        No neighbour is nearer than this, by default that of the settings.
+        Minimum distance of neighbours in px, by default from the settings.
     by_core : bool
-        Measure the brightness of neighbours in 3 × 3 px instead of their stamps: of a faint star
-        beside a bright one, a whole stamp has the other's light.
+        Measure the brightness of neighbours in 3 × 3 px instead of their stamps: the whole
+        stamp of a faint star includes light of a bright neighbour.
 
     Raises
     ------
     CalibrationStarsError
-        If there are fewer good ones than `calibration_stars.stars_min`.
+        If there are fewer good stars than `calibration_stars.stars_min`.
     """
     observation.check_list()
     # Measure 2048 stars at a time; stamps of the good ones are kept.
@@ -174,49 +175,51 @@ def collect(
         for stamps in observation.chunks(2048):
             parts.append(measure_stamps(stamps, settings, framing, observation))
             advance(len(stamps.data))
-    measured = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
+    star_columns = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
     bright = BrightStars.concatenate([stars for _, stars in parts])
-    # Stars that no criterion of a single star refuses, with their rows in the list.
-    verdict, position = measured["verdict"], measured["position"]
+    # Stars that meet all criteria of single stars, with their rows in the list.
+    verdict, position = star_columns["verdict"], star_columns["position"]
     bright = replace(bright, row=np.flatnonzero(verdict == Verdict.GOOD))
     # Saturation that the pixels show.
-    light, core = measured["snr"] * measured["noise"], measured.pop("core")
+    light, core = star_columns["snr"] * star_columns["noise"], star_columns.pop("core")
     if observation.saturate is None:
-        full = piled_up(measured["brightest"], measured["sky"], light)
-        verdict[(measured["highest"] >= full) & (verdict == Verdict.GOOD)] = Verdict.SATURATED
-    # Neighbours; a star that is listed twice is no neighbour of itself.
-    is_repeated = observation.listed_again()[:, None]
-    place = np.where(is_repeated, np.nan, position)
+        full = find_pile_up(star_columns["brightest"], star_columns["sky"], light)
+        verdict[(star_columns["highest"] >= full) & (verdict == Verdict.GOOD)] = Verdict.SATURATED
+    # Neighbours; a star that is listed twice is not a neighbour of itself.
+    is_repeated = observation.find_repeated_stars()[:, None]
+    xy = np.where(is_repeated, np.nan, position)
     isolation_px = settings.isolation_px if isolation_px is None else isolation_px
-    is_crowded = crowded(place, core if by_core else light, isolation_px, settings.neighbour_ratio)
+    is_crowded = find_crowded(
+        xy, core if by_core else light, isolation_px, settings.neighbour_ratio
+    )
     verdict[is_crowded & (verdict == Verdict.GOOD)] = Verdict.CROWDED
-    # Without a position, no other reason counts; without light, the star is no star.
-    verdict[observation.without_position()] = Verdict.NO_POSITION
+    # A missing position overrides all other reasons; a source without light is a misfit.
+    verdict[observation.lacks_position()] = Verdict.NO_POSITION
     verdict[bright.row[bright.flux <= 0]] = Verdict.MISFIT
     centring = settings.centring_px or 0.0
-    bright = _centred(bright.select(verdict[bright.row] == Verdict.GOOD), centring)
+    bright = _measure_centres(bright.select(verdict[bright.row] == Verdict.GOOD), centring)
 
-    def refuse(stars: BrightStars, refused: np.ndarray, reason: Verdict) -> BrightStars:
-        """Return the other stars, and note the reason against these."""
-        verdict[stars.row[refused]] = reason
-        return stars.select(~refused)
+    def reject(stars: BrightStars, is_rejected: np.ndarray, reason: Verdict) -> BrightStars:
+        """Return the accepted stars, and record the reason for the others."""
+        verdict[stars.row[is_rejected]] = reason
+        return stars.select(~is_rejected)
 
     # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
-    bright = refuse(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
+    bright = reject(bright, sharper_than_stars(bright.area()), Verdict.SHARP)
     # Bad pixels of the others get the values of stars nearby, before sizes are compared again.
-    bright, missing = completed(bright, framing.stamp_px, settings.search_px, centring)
-    # A star with more than a fifth of its light in bad pixels is not learnt from.
-    bright = refuse(bright, missing > 0.2, Verdict.INCOMPLETE)
+    bright, missing = fill_bad_pixels(bright, framing.stamp_px, settings.search_px, centring)
+    # A star with more than a fifth of its light in bad pixels is not used for training.
+    bright = reject(bright, missing > 0.2, Verdict.INCOMPLETE)
     # Galaxies and blends, which are wider than the stars around them. The error of ln A, with
     # A = (F/(σ S/N))², is 2 σ √P/F by the noise of the P pixels of a stamp.
     size_error = 2.0 * framing.stamp_px * bright.noise / bright.flux
     is_extended = wider_than_stars(bright.area(), bright.position, size_error)
-    bright = refuse(bright, is_extended, Verdict.EXTENDED)
+    bright = reject(bright, is_extended, Verdict.EXTENDED)
     # Stars that are unlike their neighbours.
-    aligned = cut(bright.align(), framing.stamp_px)
-    score = misfit(aligned, bright.position, bright.noise / bright.flux)
-    bright = refuse(bright, ~(score <= settings.misfit), Verdict.MISFIT)
-    candidates = Candidates(**measured, bright=bright)
+    aligned_stamps = cut(bright.align(), framing.stamp_px)
+    score = misfit(aligned_stamps, bright.position, bright.noise / bright.flux)
+    bright = reject(bright, ~(score <= settings.misfit), Verdict.MISFIT)
+    candidates = Candidates(**star_columns, bright=bright)
     candidates.require(observation.path, settings.stars_min, observation.remarks)
     return candidates
 
@@ -224,32 +227,34 @@ def collect(
 def measure_stamps(
     stamps: Stamps, settings: CalibrationStars, framing: Stamp, observation: Observation
 ) -> tuple[dict[str, np.ndarray], BrightStars]:
-    """Return columns of `Candidates` and the good stars, with neither centres nor rows.
+    """Return columns of `Candidates` and the good stars, without centres and rows.
 
     Parameters
     ----------
     stamps : Stamps
         Some stars of an image, or of a cube of stamps.
     settings : CalibrationStars
+        Limits of the criteria.
     framing : Stamp
+        Side and jitter of the stamps of the method.
     observation : Observation
         Image or cube of the stamps.
     """
-    # Sky around each star, and the star above it. The noise is that of the observation where it
-    # has a map of it.
+    # Sky around each star, and the star above it. The noise is from the noise map if the
+    # observation has one.
     side = framing.stamp_px
     level, noise = sky_around(stamps.data, stamps.bad, side)
     noise = np.maximum(noise, observation.least_noise)
     noise = np.where(np.isfinite(stamps.noise), stamps.noise, noise)
     light = np.where(stamps.bad, 0.0, stamps.data - level[:, None, None])
     wide_px = light.shape[-1]
-    # Pixels beyond the edges of the image; stamps of a cube have none.
+    # Pixels outside the image; stamps of a cube lie within it.
     off_image = np.zeros(light.shape, dtype=bool)
     if (shape := observation.shape) is not None:
         nothing = np.broadcast_to(False, shape)
         off_image = ~cut_image(nothing, shape, stamps.x, stamps.y, wide_px, margin=0)[1]
-    # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
-    # These also make the noise around a star seem large.
+    # Pixels far below the sky are dead, or of neighbours that were subtracted badly; these also
+    # increase the noise that is measured around a star.
     depth = -BrightStars.defect_sigma * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
     bad = (stamps.bad | (light < depth)) & ~off_image
     light = interpolated_stamps(np.maximum(light, depth), bad)
@@ -261,9 +266,9 @@ def measure_stamps(
     snr = stamp_snr(cut(light, side), noise)
     # A star that is smoothed to be centred has its brightest pixel anywhere.
     highest_light = (cut(light, side) if centring else cut(light, 1, peak)).max(axis=(1, 2))
-    # A bad pixel that is saturated tells of a saturated star only in the star's core.
-    saturated = cut(stamps.saturated & ~bad, side).any(axis=(1, 2))
-    saturated |= cut(stamps.saturated, 5).any(axis=(1, 2))
+    # A saturated bad pixel indicates a saturated star only in the star's core.
+    is_saturated = cut(stamps.saturated & ~bad, side).any(axis=(1, 2))
+    is_saturated |= cut(stamps.saturated, 5).any(axis=(1, 2))
     # Pixels that a stamp may need when the star is moved.
     needed_px = side + 2 * min(reach_px + framing.jitter_px + 1, (wide_px - side) // 2)
     incomplete = cut(off_image, needed_px).any(axis=(1, 2))
@@ -272,13 +277,13 @@ def measure_stamps(
     def is_flagged(flag: StarFlag) -> np.ndarray:
         return (stamps.flags & np.uint16(flag)) > 0
 
-    # The last reason that applies counts.
+    # The last reason that applies overrides the others.
     verdict = np.full(len(stamps), Verdict.GOOD, dtype="<U16")
     for reason, stars in (
         (Verdict.OFF_CENTRE, ~is_centred),
         (Verdict.FAINT, snr < settings.effective_snr_min),
         (Verdict.BLENDED, is_flagged(StarFlag.BLENDED)),
-        (Verdict.SATURATED, saturated | is_flagged(StarFlag.SATURATED)),
+        (Verdict.SATURATED, is_saturated | is_flagged(StarFlag.SATURATED)),
         (Verdict.INCOMPLETE, incomplete | is_flagged(StarFlag.TRUNCATED)),
     ):
         verdict[stars] = reason
@@ -295,7 +300,7 @@ def measure_stamps(
         "highest": cut(np.where(stamps.bad, -np.inf, stamps.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
-    # Only good stars keep their stamps; centres come later, when fewer are left.
+    # Only good stars keep their stamps; centres are measured later, for fewer stars.
     good = verdict == Verdict.GOOD
     return columns, BrightStars(
         stamps=light[good],
@@ -312,7 +317,7 @@ def measure_stamps(
     )
 
 
-def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
+def _measure_centres(stars: BrightStars, centring_px: float) -> BrightStars:
     """Return stars with their centroids, within 1.5 px of their brightest pixels per axis.
 
     The window is a Gaussian with the noise-equivalent area of the star, A = 4π σ², but at least as
@@ -325,7 +330,7 @@ def _centred(stars: BrightStars, centring_px: float) -> BrightStars:
     return replace(stars, centre=centre)
 
 
-def completed(
+def fill_bad_pixels(
     stars: BrightStars, stamp_px: int, search_px: int, centring_px: float = 0.0
 ) -> tuple[BrightStars, np.ndarray]:
     """Fill the bad pixels of stars with the PSF of the 12 nearest ones, scaled to the good pixels.
@@ -333,60 +338,60 @@ def completed(
     Parameters
     ----------
     stars : BrightStars
-        With interpolated bad pixels.
+        Stars whose bad pixels are interpolated.
     stamp_px, search_px : int
-        Side of the stamps, in which the scale is measured; distance of the brightest pixel from
-        the middle, at most.
+        Side of the stamps, in which the scale is measured; maximum distance of the brightest
+        pixel from the middle.
     centring_px : float
         FWHM of the Gaussian that smooths stars before their brightest pixel is searched.
 
     Returns
     -------
     stars : BrightStars
-        With new pixels, peaks, centres, fluxes and S/N of the stars that have bad pixels.
+        The stars, with new pixels, peaks, centres, fluxes and S/N where they have bad pixels.
     missing : ndarray, shape (n,)
         Part of the light in the stamp that is in bad pixels.
     """
     from scipy.spatial import cKDTree
 
-    # Only stars with bad pixels change; with three neighbours there is no median worth it.
+    # Only stars with bad pixels change; a median needs more than three stars.
     missing = np.zeros(len(stars))
     incomplete = np.flatnonzero(stars.bad.any(axis=(1, 2)))
     if not incomplete.size or len(stars) < 4:
         return stars, missing
-    # The nearest stars, itself among them, which is left out below.
-    place = stars.position
-    if not np.isfinite(place).all():  # all stars are as near then
-        place = np.arange(len(stars))[:, None] * np.ones(2)
-    nearest = cKDTree(place).query(place[incomplete], k=min(13, len(stars)))[1]
-    # The stamp within its margins: only there the scale is measured.
+    # The nearest stars, and the star itself, which is left out below.
+    position = stars.position
+    if not np.isfinite(position).all():  # all distances are equal then
+        position = np.arange(len(stars))[:, None] * np.ones(2)
+    nearest = cKDTree(position).query(position[incomplete], k=min(13, len(stars)))[1]
+    # The stamp within its margins, where the scale is measured.
     start = stars.stamps.shape[-1] // 2 - stamp_px // 2
     stamp = np.s_[start : start + stamp_px, start : start + stamp_px]
-    # The second time, neighbours that have bad pixels are complete, too.
+    # In the second pass, the bad pixels of neighbours are filled, too.
     for _ in range(2):
-        aligned, filled = stars.align(), stars.stamps.copy()
+        aligned_stamps, images = stars.align(), stars.stamps.copy()
         for star, neighbours in zip(incomplete, nearest, strict=True):
             # Median of the neighbours, moved to the star's centre; its flux by least squares over
             # the good pixels of the stamp, F = Σ x p / Σ p².
-            psf = np.median(aligned[neighbours[neighbours != star]], axis=0)
+            psf = np.median(aligned_stamps[neighbours[neighbours != star]], axis=0)
             psf = shift_stamps(psf[None], stars.centre[star][None])[0]
             bad = stars.bad[star]
             good = ~bad[stamp]
             square = float(np.square(psf[stamp][good]).sum())
-            flux = float((filled[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
-            filled[star][bad] = flux * psf[bad]
+            flux = float((images[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
+            images[star][bad] = flux * psf[bad]
             missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
-        # Measure these stars again; one without light is lost, and keeps its measurements.
-        light = filled[incomplete]
+        # Measure these stars again; a star without light keeps its measurements.
+        light = images[incomplete]
         peak = brightest_pixels(light, search_px, centring_px)[0]
         flux = cut(light, stamp_px, peak).sum(axis=(1, 2))
         snr = stamp_snr(cut(light, stamp_px), stars.noise[incomplete])
         usable = (flux > 0) & (snr > 0)
         missing[incomplete[~usable]] = 1.0
         new = replace(stars.select(incomplete), stamps=light, peak=peak, flux=flux, snr=snr)
-        new = _centred(new.select(usable), centring_px)
+        new = _measure_centres(new.select(usable), centring_px)
         columns = {name: getattr(stars, name).copy() for name in ("peak", "flux", "snr", "centre")}
         for name, column in columns.items():
             column[incomplete[usable]] = getattr(new, name)
-        stars = replace(stars, stamps=filled, **columns)
+        stars = replace(stars, stamps=images, **columns)
     return stars, missing

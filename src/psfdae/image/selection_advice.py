@@ -1,6 +1,6 @@
 """Advice on settings that neither the header nor the user gives, from the stars of an image.
 
-In: the measured stars (`selection`). Out: sentences with the advice and what it rests on.
+Input: the measured stars (`selection`). Output: sentences with the advice and its reasons.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from psfdae.base.errors import keyword
 from psfdae.image.observation import Observation
 from psfdae.image.selection import Candidates
 from psfdae.image.stamps import cut
-from psfdae.image.star_criteria import overlapping, piled_up
+from psfdae.image.star_criteria import find_pile_up, measure_overlap
 
 
 def advice(candidates: Candidates, observation: Observation, stamp_px: int) -> list[str]:
-    """Return sentences on saturation, gain and the size of stamps, for a training on stars."""
+    """Return sentences on saturation, gain and the size of stamps, for training on stars."""
     sentences = [stamp_advice(candidates, stamp_px)]
     if observation.saturate is None:
         sentences.append(saturation_advice(candidates))
@@ -25,12 +25,12 @@ def advice(candidates: Candidates, observation: Observation, stamp_px: int) -> l
 
 
 def saturation_advice(candidates: Candidates) -> str:
-    """Return advice on saturation, from where brightest pixels pile up.
+    """Return advice on saturation, from the level at which brightest pixels pile up.
 
     Stars that are cut off have the same brightest pixel, however bright they are.
     """
-    # Counts from which brightest pixels agree; infinite if they do not.
-    level = piled_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
+    # Counts at which brightest pixels agree; infinite if they do not.
+    level = find_pile_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
     if not np.isfinite(level):
         return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
     star_count = np.count_nonzero(candidates.brightest >= level)
@@ -43,7 +43,7 @@ def saturation_advice(candidates: Candidates) -> str:
 
 
 def gain_advice(candidates: Candidates) -> str:
-    """Return advice on the gain by sky and noise, if photons make it: variance = level / gain.
+    """Return advice on the gain from sky and photon noise: variance = level / gain.
 
     Photons of a sky of L counts make the noise σ = √(L / gain) counts, hence gain = L / σ².
     """
@@ -61,17 +61,18 @@ def gain_advice(candidates: Candidates) -> str:
 def stamp_advice(
     candidates: Candidates, stamp_px: int, light_wanted: float = 0.985, step_px: int = 4
 ) -> str | None:
-    """Return advice on the stamps: light of the median star in squares, and how many overlap.
+    """Return advice on the size of stamps, from the light of the median star and from overlaps.
 
     Parameters
     ----------
     candidates : Candidates
+        The measured stars.
     stamp_px : int
-        Side of the stamps now.
+        Current side of the stamps.
     light_wanted : float
-        Part of a star's light, as far as it is seen, that a stamp should hold.
+        Part of a star's visible light that a stamp should hold.
     step_px : int
-        Difference of two sides from which it is worth a word.
+        Minimum difference of the sides for which advice is given.
 
     Returns
     -------
@@ -83,16 +84,16 @@ def stamp_advice(
     sides = np.arange(8, typical.shape[-1] + 1, 2)
     light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
     # The first side that holds enough light.
-    needed = int(sides[np.argmax(light >= light_wanted)])
-    if abs(needed - stamp_px) < step_px:
+    side_px = int(sides[np.argmax(light >= light_wanted)])
+    if abs(side_px - stamp_px) < step_px:
         return None
     # How many stamps of either size have a second star.
-    shared = ", ".join(
-        f"{100 * overlapping(candidates.position, side):.0f} % of {side} px"
-        for side in (stamp_px, needed)
+    overlap = ", ".join(
+        f"{100 * measure_overlap(candidates.position, side):.0f} % of {side} px"
+        for side in (stamp_px, side_px)
     )
     return (
-        f"stamp size: {100 * light_wanted:g} % of the median star's light are within {needed} px; "
-        f"another star of the list stands in {shared}: {keyword('stamp_px', needed)} is worth a "
+        f"stamp size: {100 * light_wanted:g} % of the median star's light are within {side_px} px; "
+        f"another star of the list stands in {overlap}: {keyword('stamp_px', side_px)} is worth a "
         "trial"
     )

@@ -1,11 +1,10 @@
 """Level and noise of the sky of an image, also where it has steps or structure.
 
-In: an image (h, w) and the pixels that do not count. Out: `SkyLevel`, a level and a σ for each
-pixel.
+Inputs: an image (h, w) and its bad pixels. Output: `SkyLevel`, a level and a σ for each pixel.
 
 photutils measures both in meshes and interpolates between them. Amplifiers of different bias make
 steps, which are found first: each part of the image has meshes of its own. A nebula, or the halo of
-a bright star, changes within a mesh; there the level is a median of the pixels around.
+a bright star, changes within a mesh; there the level is a median of the surrounding pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class SkyStructure(NamedTuple):
     rows, columns : sequence of int
         Rows and columns at which the level has a step.
     is_fine : bool
-        True if the level changes within a mesh: where it does, it is a median of the pixels around.
+        True if the level changes within a mesh; there it is a median of the surrounding pixels.
     pixel_step : float
         Step of the pixels if they are whole counts and noise is not much wider, else 0.
     """
@@ -50,7 +49,7 @@ class SkyLevel(NamedTuple):
         Level and σ of the sky at each pixel.
     structure : SkyStructure
     notes : tuple of str
-        Sentences on what is unusual in the sky.
+        Sentences on unusual properties of the sky.
     """
 
     level: np.ndarray
@@ -67,20 +66,20 @@ def sky_level(
     Parameters
     ----------
     image : ndarray, shape (h, w)
-        Finite.
+        Finite pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are ignored.
     structure : SkyStructure, optional
-        Structure of the sky, if it was found before: in the same image with its stars.
+        Structure of the sky, if known from the same image with its stars.
     mesh_px : int
         Side of the squares in which the sky is measured.
 
     Raises
     ------
     ValueError
-        If no mesh has enough pixels that count.
+        If no mesh has enough good pixels.
     """
-    # Medians of whole counts are those of the counts before rounding.
+    # Dither whole counts, so that medians are not rounded.
     step = structure.pixel_step if structure else count_step(np.where(bad, np.nan, image))
     image, dither_variance = dither(image, step)
     if structure is None:
@@ -98,7 +97,7 @@ def sky_level(
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
     noise = remove_dither(noise, dither_variance)
-    # Errors are of sums of pixels, which have more noise where neighbours share it.
+    # Errors refer to sums of pixels, whose noise is larger if neighbours are correlated.
     with np.errstate(all="ignore"):
         correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
     if correlation > 1.0:
@@ -116,9 +115,9 @@ def level_and_noise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return level and σ (h, w) of a sky of known steps, and the part of it with fine structure.
 
-    The noise is that of single pixels; parameters are those of `sky_level`. Both are those of the
+    The noise is of single pixels; parameters are as in `sky_level`. Level and noise are from the
     meshes, and the part is 0, unless the sky is known to have fine structure, or over 5 % of the
-    image has structure that is not that of the sources.
+    image has structure that is not due to sources.
     """
     # Each part between steps has meshes of its own. Single precision: of a large image, each map
     # takes much memory.
@@ -128,10 +127,10 @@ def level_and_noise(
         for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
             part = np.s_[top:bottom, first:last]
             if not bad[part].all() or not (rows or columns):
-                level[part], noise[part] = _meshed(image[part], bad[part], mesh_px)
+                level[part], noise[part] = _measure_sky(image[part], bad[part], mesh_px)
     # Structure that is finer than the meshes: σ of a mesh over σ from differences of neighbouring
     # pixels is larger there than elsewhere by a factor of 1.5; in resampled images it is larger
-    # everywhere. Both are of meshes: every fourth pixel shows them.
+    # everywhere. Both change slowly: every fourth pixel is enough.
     pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
     sample = np.s_[::4, ::4]
     ratio = noise[sample] / pixel_sigma[sample]
@@ -141,14 +140,14 @@ def level_and_noise(
     if not (is_fine or share > 0.05):
         return level, noise, 0.0
     fine_level = median_level(image - level, bad)
-    if not (is_fine or sources_stay(image - level, fine_level, bad, pixel_sigma)):
+    if not (is_fine or keeps_peaks(image - level, fine_level, bad, pixel_sigma)):
         return level, noise, 0.0
     weight = structure_weight(noise / (typical_ratio * pixel_sigma), bad, mesh_px)
     level += weight * fine_level
-    # What remains; its noise changes with the light of the structure, from mesh to mesh of 16.
-    remainder, noise = _meshed(image - level, bad, mesh_px)
+    # The remainder; its noise changes with the light of the structure, in meshes of 16 px.
+    remainder, noise = _measure_sky(image - level, bad, mesh_px)
     level += remainder
-    noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
+    noise += weight * (_measure_sky(image - level, bad, 16)[1] - noise)
     return level, noise, share
 
 
@@ -158,13 +157,14 @@ def level_and_noise(
 def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the noise (h, w) of pixels from the differences of neighbours, in squares of 64.
 
-    It is infinite where neighbours do not differ: there is no noise with which to compare.
+    It is infinite where neighbours do not differ, so that ratios to it are 0.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are ignored.
     """
     # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
     difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
@@ -186,18 +186,18 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
 
 
 def noise_correlation(deviation: np.ndarray) -> float:
-    """Return the noise of sums of pixels over that of independent ones, at least 1.
+    """Return the noise of sums of pixels over sums of independent pixels, at least 1.
 
-    √(Σ ρ) over the correlations ρ of pixels up to 2 px apart. Faint sources and structure of the
-    sky correlate pixels 3 and 4 px apart nearly as much as neighbours, along rows and columns
-    alike; the ρ at these distances is of them, and is subtracted. A ρ that is larger along rows or
-    columns only is noise: offsets of rows or columns, as of 1/f noise. Unless 0.15 are left of the
-    correlation of neighbours, or 0.05 of rows or columns, the result is 1.
+    It is √(Σ ρ) over the correlations ρ of pixels up to 2 px apart. Faint sources and structure of
+    the sky correlate pixels 3 and 4 px apart nearly as much as neighbours, along rows and columns
+    alike; the ρ at these distances is due to them, and is subtracted. A larger ρ along rows or
+    columns only is noise: offsets of rows or columns, as from 1/f noise. The result is 1 unless
+    0.15 remain of the correlation of neighbours then, or 0.05 along rows or columns.
 
     Parameters
     ----------
     deviation : ndarray, shape (h, w)
-        Pixels without their sky, in σ; NaN where they do not count. Sources are left out here.
+        Pixels without their sky, in σ; NaN where they are ignored. Sources are masked here.
     """
     # The middle of a large image is enough.
     middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
@@ -228,7 +228,7 @@ def noise_correlation(deviation: np.ndarray) -> float:
 
 
 def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> float:
-    """Return the correlation of pixels (h, w) and those some rows below and columns to the right.
+    """Return the correlation of pixels (h, w) with pixels some rows below and columns to the right.
 
     ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)) of pairs a, b, with s by median deviations;
     0 if fewer than 1000 pairs are finite.
@@ -248,46 +248,48 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
 # Meshes.
 
 
-def _meshed(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad.
+def _measure_sky(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Measure level and σ in meshes and interpolate them, (h, w); 80 % of a mesh may be bad.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are ignored.
     mesh_px : int
-        Side of the meshes.
+        Side of the meshes in px.
 
     Raises
     ------
     ValueError
-        If every mesh has more bad pixels than that.
+        If every mesh has more than 80 % bad pixels.
     """
     from photutils.background import Background2D
 
     meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
     level, sigma = meshes.background_mesh, meshes.background_rms_mesh
-    neighbours = _of_neighbours(level)
-    # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
-    # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself
-    # (James & Stein 1961). A mesh that differs by far more than the others has stars in it.
+    neighbours = _smooth_meshes(level)
+    # A mesh differs from its neighbours by its error, about 2.5 σ/√N for the mode of N pixels, and
+    # by the curvature of the sky: the larger the curvature, the larger its own weight (James &
+    # Stein 1961). A mesh that differs by far more than the others has stars in it.
     deviation = level - neighbours
     scatter = 1.4826 * float(np.median(np.abs(deviation)))
     error = 2.5 * float(np.median(sigma)) / mesh_px
     mesh_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
     has_stars = np.abs(deviation) > 4.0 * max(scatter, error)
     smooth = neighbours + np.where(has_stars, 0.0, mesh_weight * deviation)
-    noise = _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0)
-    return _on_pixels(smooth, image.shape, mesh_px, mesh_weight), noise
+    noise = _to_pixels(_smooth_meshes(sigma), image.shape, mesh_px, 0.0)
+    return _to_pixels(smooth, image.shape, mesh_px, mesh_weight), noise
 
 
-def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
-    """Return values of meshes (m, n), continued beyond the edges with a part of their slope.
+def _extrapolate(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
+    """Extrapolate values of meshes (m, n) beyond the edges with a part of their slope.
 
     Parameters
     ----------
     mesh : ndarray, shape (m, n)
+        Values in the meshes.
     width : int
         Number of meshes that are added on each side.
     slope : float
@@ -304,14 +306,14 @@ def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
     return mesh
 
 
-def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
-    """Return values of meshes (m, n) by their neighbours, without a few that are far off.
+def _smooth_meshes(mesh: np.ndarray) -> np.ndarray:
+    """Smooth values of meshes (m, n) by their neighbours, without outliers.
 
-    It is the median of the value itself and of the means of the four pairs of neighbours that face
-    each other: all five are the same where the sky is a plane, up to the edges of the image.
+    The result is the median of the value itself and of the means of the four pairs of opposite
+    neighbours: all five are the same where the sky is a plane, up to the edges of the image.
     """
-    # Meshes beyond the edges go on along straight lines.
-    squares = np.lib.stride_tricks.sliding_window_view(_continued(mesh, 1), (3, 3))
+    # Meshes outside the edges are extrapolated along straight lines.
+    squares = np.lib.stride_tricks.sliding_window_view(_extrapolate(mesh, 1), (3, 3))
     pairs = [
         0.5 * (squares[..., 1 + down, 1 + across] + squares[..., 1 - down, 1 - across])
         for down, across in ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -319,30 +321,31 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
 
-def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: float) -> np.ndarray:
-    """Return values of meshes (m, n) at the pixels of an image (h, w), by cubic splines.
+def _to_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: float) -> np.ndarray:
+    """Interpolate values of meshes (m, n) to the pixels of an image (h, w), by cubic splines.
 
-    Beyond the middles of the outer meshes they go on with a part of their slope.
+    Outside the middles of the outer meshes they are extrapolated with a part of their slope.
 
     Parameters
     ----------
     mesh : ndarray, shape (m, n)
+        Values in the middles of the meshes.
     shape : tuple of int
         Rows and columns of the image.
     mesh_px : int
         Side of a mesh in pixels.
     slope : float
-        Part of the slope beyond the outer meshes, as of `_continued`.
+        Part of the slope outside the outer meshes, as in `_extrapolate`.
     """
-    continued = _continued(mesh, 2, slope)
+    extended_mesh = _extrapolate(mesh, 2, slope)
     # The spline is a product of splines along rows and columns, and linear in the meshes: a weight
     # is the value at a pixel of the spline through 1 in one mesh and 0 in all others.
     weights = []
-    for pixels, meshes in zip(shape, continued.shape, strict=True):
+    for pixels, meshes in zip(shape, extended_mesh.shape, strict=True):
         position = (np.arange(pixels) + 0.5) / mesh_px - 0.5 + 2.0
         at = np.meshgrid(position, np.arange(meshes), indexing="ij")
         weights.append(scipy.ndimage.map_coordinates(np.eye(meshes), at, order=3, mode="nearest"))
-    row_weights, columns = weights[0], continued @ weights[1].T
+    row_weights, columns = weights[0], extended_mesh @ weights[1].T
     # A few rows at a time: products take twice the memory of the values.
     values = np.empty(shape, np.float32)
     for top in range(0, len(values), 256):
@@ -359,9 +362,9 @@ def median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     height, width = image.shape
     even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
     squares = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2)
-    binned = squares.mean(axis=(1, 3))
+    square_means = squares.mean(axis=(1, 3))
     # Median of 7 × 7 squares, smoothed by σ = 1 square.
-    smooth = scipy.ndimage.median_filter(binned, 7, mode="nearest")
+    smooth = scipy.ndimage.median_filter(square_means, 7, mode="nearest")
     smooth = scipy.ndimage.gaussian_filter(smooth, 1.0)
     # Back to the pixels: linear between the middles of the squares.
     row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
@@ -369,11 +372,11 @@ def median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return np.asarray(scipy.ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
 
 
-def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
+def keeps_peaks(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
     """Return True if the brightest sources of an image (h, w) keep most of their peaks.
 
-    A level (h, w) that takes more than a quarter of them is that of the sources themselves. Without
-    five sources of 50 σ, such as where their models are subtracted, there are none to lose.
+    A level (h, w) that removes more than a quarter of their peaks follows the sources themselves.
+    With fewer than five sources of 50 σ, such as where their models are subtracted, it is True.
 
     Parameters
     ----------
@@ -382,10 +385,11 @@ def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: n
     level : ndarray, shape (h, w)
         Finer level that would be subtracted as well.
     bad : ndarray of bool, shape (h, w)
+        Pixels that are not searched for peaks.
     noise : ndarray, shape (h, w)
         σ of the pixels.
     """
-    # Local maxima of 25 px around, and the 30 highest of them.
+    # Local maxima in squares of 25 px, and the 30 highest of them.
     height = light - level
     high = (height == scipy.ndimage.maximum_filter(height, 25)) & ~bad
     peak = np.flatnonzero(high & (light > 50.0 * noise))
@@ -395,20 +399,21 @@ def sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: n
 
 
 def structure_weight(noise_excess: np.ndarray, bad: np.ndarray, mesh_px: int) -> np.ndarray:
-    """Return how much the sky of an image changes within a mesh, from 0 to 1, (h, w).
+    """Return the weight of the fine level of a sky, from 0 to 1, (h, w).
 
     Parameters
     ----------
     noise_excess : ndarray, shape (h, w)
-        σ of a mesh over that from differences of neighbouring pixels, over the usual ratio.
+        σ of a mesh over σ from differences of neighbouring pixels, over its typical value.
     bad : ndarray of bool, shape (h, w)
+        Pixels whose own weight is 0.
     mesh_px : int
-        Side of a mesh.
+        Side of a mesh in px.
     """
-    # From 0 at 1.25 times the usual noise to 1 at 1.75 times.
+    # From 0 at 1.25 times the typical ratio to 1 at 1.75 times.
     weight = np.clip((noise_excess - 1.25) / 0.5, 0.0, 1.0)
     weight[bad] = 0.0
-    # Meshes beside those with structure are interpolated from these, and wrong, too.
+    # Meshes next to structure are interpolated from it, and wrong, too.
     wide_weight = scipy.ndimage.maximum_filter(weight, 2 * mesh_px + 1, mode="nearest")
     return np.asarray(scipy.ndimage.uniform_filter(wide_weight, mesh_px, mode="nearest"))
 
@@ -419,16 +424,18 @@ def structure_weight(noise_excess: np.ndarray, bad: np.ndarray, mesh_px: int) ->
 def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24) -> list[int]:
     """Return the rows (axis 0) or columns (axis 1) at which the sky of an image has a step.
 
-    The step goes along the whole line or half of it.
+    The step extends along the whole line or half of it.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are ignored.
     axis : int
+        0 for steps between rows, 1 for steps between columns.
     reach_px : int
-        Width of the strips on both sides of a line that say whether there is a step.
+        Width in px of the strips on both sides of a line that are compared.
     """
     # Along all of the line and its halves, each with at most 512 columns of it.
     values, good = (image, ~bad) if axis == 0 else (image.T, ~bad.T)
@@ -448,15 +455,16 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24)
 def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[int]:
     """Return the rows of some columns (h, n) at which the level has a step.
 
-    It is the same in all eighths of the columns, up to 3 px from the row and from 3 to 12 and 12 to
-    24 px, slopes subtracted; and above a tenth of the noise, eight times its error, and four times
-    the scatter of all rows.
+    A step is the same in most eighths of the columns, up to 3 px from the row and from 3 to 12 and
+    12 to 24 px, slopes subtracted; and above a tenth of the noise, eight times its error, and four
+    times the scatter of all rows.
 
     Parameters
     ----------
     values : ndarray, shape (h, n)
+        Pixels of the image, or of every few columns.
     good : ndarray of bool, shape (h, n)
-        Pixels that count.
+        Pixels that are used.
     reach_px : int
         Rows on either side of a step that must show it, 24.
     """
@@ -470,7 +478,7 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     side = reach_px // 2
 
     def jumps(start: int, end: int, at: np.ndarray) -> np.ndarray:
-        """Return the mean of each column from `start` to `end` px after rows, less that before."""
+        """Return the mean of each column `start` to `end` px after rows, less the mean before."""
         with np.errstate(all="ignore"):
             mean_after, mean_before = (
                 (light[b] - light[a]) / (number[b] - number[a])
@@ -485,7 +493,7 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
         middle = _row_medians(step_sizes)
         spread = 1.4826 * _row_medians(np.abs(step_sizes - middle[:, None]))
         # Slope of the level per px: changes within 12 px on both sides, a pixel off the line. Of
-        # two signs there is no slope, but bad rows.
+        # two signs they are bad rows, not a slope.
         slope_before = _row_medians(jumps(0, side, lines - side - 1))
         slope_after = _row_medians(jumps(0, side, lines + side + 1))
         smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
@@ -498,8 +506,8 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
         row_scatter = float(robust_scatter(jump[np.isfinite(jump)]))
         limit = np.maximum(np.maximum(0.1 * noise, 8.0 * error), 4.0 * row_scatter)
         candidates = np.flatnonzero(np.abs(jump) > limit)
-        # Candidates from the largest jump on: each must be the same in most eighths of the line and
-        # at all three distances.
+        # Candidates from the largest jump on: each must agree in most eighths of the line and at
+        # all three distances.
         steps: list[int] = []
         for k in candidates[np.argsort(-np.abs(jump[candidates]))]:
             line, height_of_step = int(lines[k]), jump[k]
@@ -516,6 +524,6 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
 
 
 def _row_medians(values: np.ndarray) -> np.ndarray:
-    """Return the median of each row (m, n) without its NaN; NaN if a row has nothing else."""
+    """Return the median of each row (m, n) without its NaN; NaN if all values are."""
     median = np.nanmedian if np.isnan(values).any() else np.median
     return np.asarray(median(values, axis=1))

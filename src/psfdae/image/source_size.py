@@ -1,10 +1,10 @@
-"""Size of the stars of an image: the light of the median star by radius, and what follows.
+"""Size of the stars of an image, from the light of the median star as a function of radius.
 
-In: an image without its sky and the positions of its stars. Out: `SourceSize`.
+Inputs: an image without its sky and the positions of its stars. Output: `SourceSize`.
 
-The profile of a star is the median of the pixels of a ring about its centre, in which a neighbour
-does not count, above the median far outside. That of all stars is the median again, up to the
-radius from which it is no more than its own noise: there the stars meet the sky.
+The profile of a star is the median of the pixels in rings about its centre, which excludes
+neighbours, above the median far outside. The profile of all stars is the median of their profiles,
+up to the radius at which it falls below its own noise: there the stars meet the sky.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class SourceSize:
     Attributes
     ----------
     radius_px : ndarray, shape (k,)
-        Outer radii of rings, ascending, up to where the star meets the sky; and twice that.
+        Outer radii of rings, ascending, up to where the star meets the sky; then twice this radius.
     light : ndarray, shape (k,)
-        Part of its light within them, the last one 1.
+        Part of the light within these radii; the last one is 1.
     peak_offset_px : float
         Median distance of the brightest pixel from the centre, the larger of row and column.
     sharpness_px : float
@@ -45,30 +45,30 @@ class SourceSize:
     @property
     def fwhm_px(self) -> float:
         """Twice the radius of half of the light, which is the FWHM of a Gaussian."""
-        # No light is within radius 0.
+        # The light within radius 0 is 0.
         light, radius = (np.append(0.0, values) for values in (self.light, self.radius_px))
         return 2.0 * float(np.interp(0.5, light, radius))
 
     def light_within(self, side_px: int) -> float:
-        """Return the part of the light in a square, by that in a circle of the same area."""
+        """Return the part of the light in a square, from a circle of the same area."""
         radius = side_px / np.sqrt(np.pi)
         return float(np.interp(radius, np.append(0.0, self.radius_px), np.append(0.0, self.light)))
 
     @property
-    def hollow(self) -> bool:
-        """True if most stars have their brightest pixel off their centre, as rings have."""
+    def is_hollow(self) -> bool:
+        """True if most stars have their brightest pixel off their centre, as rings do."""
         return self.peak_offset_px > 1.0
 
     def side(self, light_min: float) -> int:
         """Return the side of stamps, one of `sides`.
 
         It is 16 px if these hold `light_min` of the light, else the first that holds 98 %.
-        The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
-        star lies, and 99 % of its light must.
+        The edge of a hollow star is bright: it must be within the stamp at any phase on the pixel
+        grid, with 99 % of the light.
         """
-        if not self.hollow and self.light_within(self.sides[0]) >= light_min:
+        if not self.is_hollow and self.light_within(self.sides[0]) >= light_min:
             return self.sides[0]
-        edge_px, part = (2, 0.99) if self.hollow else (0, 0.98)
+        edge_px, part = (2, 0.99) if self.is_hollow else (0, 0.98)
         sides = (side for side in self.sides if self.light_within(side - edge_px) >= part)
         return next(sides, self.sides[-1])
 
@@ -83,56 +83,57 @@ def measure_size(
     flat : ndarray, shape (h, w)
         Image without its sky.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are ignored.
     position : ndarray, shape (n, 2)
-        (x, y) of stars, of which the brightest count; NaN where unknown.
+        (x, y) of stars, of which the brightest are used; NaN where unknown.
     reach_px : int
         Radius of the windows in which stars are measured.
     stars_max : int
-        Number of stars that are measured, at most.
+        Maximum number of stars that are measured.
 
     Returns
     -------
     SourceSize or None
-        None if no star is seen.
+        None if no star has light.
     """
     from scipy import ndimage
 
-    # The brightest stars by the light within 8 px; bad pixels have none.
-    place = np.floor(position[np.isfinite(position).all(axis=1)][:, ::-1] + 0.5).astype(np.int64)
-    place = place[((place >= 0) & (place < flat.shape)).all(axis=1)]
-    if not len(place):
+    # The brightest stars by the light within 8 px; bad pixels are 0.
+    pixel = np.floor(position[np.isfinite(position).all(axis=1)][:, ::-1] + 0.5).astype(np.int64)
+    pixel = pixel[((pixel >= 0) & (pixel < flat.shape)).all(axis=1)]
+    if not len(pixel):
         return None
     clean = np.where(bad, 0.0, flat)
-    light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(place.T)]
-    brightest = place[np.argsort(-light, kind="stable")[:stars_max]]
-    # Windows (n, s, s) about them; pixels off the image were not measured.
+    light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(pixel.T)]
+    brightest = pixel[np.argsort(-light, kind="stable")[:stars_max]]
+    # Windows (n, s, s) about them; pixels off the image are ignored.
     windows_at = (flat.shape, brightest[:, 1], brightest[:, 0], 2 * reach_px + 1, 0)
     windows, inside, _ = cut_image(clean, *windows_at)
-    measured = inside & (cut_image(bad, *windows_at)[0] == 0)
-    # The centre under a window as wide as the star, of which the first profile knows the width.
+    is_measured = inside & (cut_image(bad, *windows_at)[0] == 0)
+    # The centre under a window as wide as the star, from the first profile.
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):
-        size = size_of_windows(windows, measured, centre)
+        size = measure_windows(windows, is_measured, centre)
         if size is None:
             return None
-        # A ring has no light in its middle: a window narrower than its radius would leave it.
+        # A ring is dark in its middle: a window narrower than its radius would drift off.
         sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
-        visible = np.where(measured, windows, 0.0)
+        visible = np.where(is_measured, windows, 0.0)
         centre = find_centroids(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
-    return size_of_windows(windows, measured, centre)
+    return measure_windows(windows, is_measured, centre)
 
 
-def size_of_windows(
-    windows: np.ndarray, measured: np.ndarray, centre: np.ndarray
+def measure_windows(
+    windows: np.ndarray, is_measured: np.ndarray, centre: np.ndarray
 ) -> SourceSize | None:
-    """Return the size by the median profile of stars; None if they have no light.
+    """Measure the size from the median profile of stars; None without light.
 
     Parameters
     ----------
     windows : ndarray, shape (n, s, s)
-    measured : ndarray of bool, shape (n, s, s)
-        Pixels that count.
+        Images of the stars without their sky.
+    is_measured : ndarray of bool, shape (n, s, s)
+        Pixels that are used.
     centre : ndarray, shape (n, 2)
         Centres (row, column) from the middle of the windows.
     """
@@ -140,10 +141,10 @@ def size_of_windows(
     axis = np.arange(windows.shape[-1]) - reach_px
     edges = np.concatenate([np.arange(0.0, 10.0), np.arange(10.0, reach_px - 3.0, 2.0)])
     area = np.pi * np.diff(edges**2)
-    # Light per pixel in the rings of each star, and how far its brightest pixel is off.
+    # Light per pixel in the rings of each star, and the offset of its brightest pixel.
     rings = np.empty((len(windows), len(area)))
     offset = np.empty(len(windows))
-    stars = zip(windows, measured, centre, strict=True)
+    stars = zip(windows, is_measured, centre, strict=True)
     for star, (window, good, (row, column)) in enumerate(stars):
         # Distance of each pixel from the centre of the star.
         radius = np.hypot(axis[:, None] - row, axis - column)
@@ -152,23 +153,23 @@ def size_of_windows(
         core = np.where(radius < max(4.0, reach_px / 6), window, -np.inf)
         peak = np.unravel_index(core.argmax(), core.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))
-    # Above the sky, the median of the four outer rings; of flux 1 within 16 px.
-    with silent():  # near an edge, the outer rings of a star may have no pixel
+    # Subtract the sky, the median of the four outer rings; scale to flux 1 within 16 px.
+    with silent():  # near an edge, the outer rings of a star may be empty
         rings = rings - np.nanmedian(rings[:, -4:], axis=1)[:, None]
     flux = np.nansum(rings[:, edges[1:] <= 16] * area[edges[1:] <= 16], axis=1)
     usable = np.isfinite(rings).mean(axis=1) > 0.5
     usable &= np.isfinite(flux) & (flux > 0)
     if not usable.any():
         return None
-    scaled = rings[usable] / flux[usable, None]
-    # Median profile, up to the first ring that half of the stars do not have.
-    is_covered = np.isfinite(scaled).sum(axis=0) > 0.5 * usable.sum()
+    profiles = rings[usable] / flux[usable, None]
+    # Median profile, up to the first ring that half of the stars lack.
+    is_covered = np.isfinite(profiles).sum(axis=0) > 0.5 * usable.sum()
     last = len(is_covered) if is_covered.all() else int(np.argmin(is_covered))
-    scaled = scaled[:, :last]
-    scaled = np.where(np.isfinite(scaled), scaled, np.nanmedian(scaled, axis=0))
-    profile = np.median(scaled, axis=0)
-    # 1.25 σ/√n is the error of a median; three of these above 0 are light.
-    error = 1.25 * robust_scatter(scaled) / np.sqrt(len(scaled))
+    profiles = profiles[:, :last]
+    profiles = np.where(np.isfinite(profiles), profiles, np.nanmedian(profiles, axis=0))
+    profile = np.median(profiles, axis=0)
+    # 1.25 σ/√n is the error of a median; a profile above three errors is light.
+    error = 1.25 * robust_scatter(profiles) / np.sqrt(len(profiles))
     dark = (profile <= 3.0 * error) & (edges[1 : last + 1] > 4)
     end = int(np.argmax(dark)) if dark.any() else last
     profile, end_px = profile[:end], edges[end]
@@ -176,8 +177,8 @@ def size_of_windows(
     light = np.cumsum(profile * area[:end])
     if not len(light) or light[-1] <= 0:
         return None
-    # Light beyond the end, if the profile p falls on by the power law of its outer half:
-    # ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k at least 4; a tenth at most.
+    # Light outside the end, if the profile p continues with the power law of its outer half:
+    # ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k ≥ 4; a tenth at most.
     light_beyond, middle = 0.0, 0.5 * (edges[:end] + edges[1 : end + 1])
     is_outer = (middle > 0.5 * end_px) & (profile > 0)
     if np.count_nonzero(is_outer) >= 3:
@@ -185,7 +186,7 @@ def size_of_windows(
         light_beyond = float(2.0 * np.pi * np.exp(height) * end_px**2 / (max(-slope, 4.0) - 2.0))
     radius = np.append(edges[1 : end + 1], 2.0 * end_px)
     light = np.append(light, light[-1] + min(light_beyond, 0.1 * light[-1]))
-    # The inner 49 × 49 px of the median star say how fine its structure is.
+    # The inner 49 × 49 px of the median star show how fine its structure is.
     middle_px = slice(reach_px - 24, reach_px + 25)
     middles = windows[usable][:, middle_px, middle_px]
     stamp = np.median(middles / flux[usable][:, None, None], axis=0)
@@ -199,8 +200,7 @@ def size_of_windows(
 def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the light per pixel of a star in rings between some radii, (k,), NaN without pixels.
 
-    Within a few pixels a star is not round on the pixel grid: the mean is the light; beyond 4 px,
-    the median is.
+    Within 4 px, where a star is not round on the pixel grid, it is the mean; outside, the median.
 
     Parameters
     ----------

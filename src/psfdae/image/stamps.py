@@ -1,7 +1,7 @@
 """Stamps of stars: the container, flags of stars, and how stamps are cut, measured and centred.
 
-A stamp is a square of pixels about a star, sky included. Positions in an image go in where stamps
-are cut; sky, scatter and displacement of each stamp come out.
+A stamp is a square of pixels about a star, sky included. Stamps are cut at positions in an image;
+sky, scatter and displacement of each stamp are measured.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from psfdae.stars.moments import FWHM_OF_SIGMA, count_step, dither, remove_dithe
 
 @dataclass(frozen=True)
 class Stamps:
-    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars.
+    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and columns of the stars.
 
     Attributes
     ----------
     data : ndarray, shape (n, s, s)
         Counts, sky included; 0 where not finite or off the image.
     bad, saturated : ndarray of bool, shape (n, s, s)
-        Masked pixels, and those that `data` does not show; pixels at the saturation.
+        Masked, missing and non-finite pixels; pixels at the saturation level.
     flags : ndarray of uint16, shape (n,)
-        `StarFlag`s of the list; TRUNCATED: off the image, margin aside.
+        `StarFlag`s of the list; TRUNCATED if a pixel, margin aside, is off the image.
     id : ndarray of int64 or str, shape (n,)
+        Identifiers of the stars.
     x, y : ndarray, shape (n,)
         Position in the image, 0-based pixel centres.
     flux, background, noise : ndarray, shape (n,)
@@ -41,11 +42,11 @@ class Stamps:
     gain : ndarray, shape (n,)
         Electrons per unit of the stamps.
     magnitude : ndarray, shape (n,)
-        Magnitude for which the PSF is asked; NaN for that of the flux that is estimated.
+        Magnitude at which the PSF is evaluated; NaN for the magnitude of the estimated flux.
     colour : ndarray, shape (n,)
-        By the list, such as g − r.
+        Colour from the list, such as g − r.
     listed : ndarray, shape (n, 2)
-        Centre (row, column) from index s//2 by the list.
+        Centre (row, column) from index s//2, from the list.
 
     All are NaN where unknown.
     """
@@ -75,7 +76,7 @@ class Stamps:
 
 
 class StarFlag(IntFlag):
-    """Reasons to distrust a star; flags add up. Rows are flagged, never dropped.
+    """Reasons to distrust a star; flags are summed. Rows are flagged, never dropped.
 
     Examples
     --------
@@ -88,7 +89,7 @@ class StarFlag(IntFlag):
     meaning: str
 
     def __new__(cls, value: int, meaning: str = "") -> Self:
-        """Make a flag with a line that says what it means."""
+        """Make a flag with a line on its meaning."""
         flag = int.__new__(cls, value)
         flag._value_ = value
         flag.meaning = meaning
@@ -144,8 +145,8 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
     Pixel k covers k − ½ ≤ position < k + ½.
     """
     limit = LARGEST_POSITION_PX
-    rounded = np.floor(np.nan_to_num(position, nan=-limit, posinf=limit, neginf=-limit) + 0.5)
-    return np.asarray(np.clip(rounded, -limit, limit), np.int64)
+    pixel = np.floor(np.nan_to_num(position, nan=-limit, posinf=limit, neginf=-limit) + 0.5)
+    return np.asarray(np.clip(pixel, -limit, limit), np.int64)
 
 
 def cut_image(
@@ -160,17 +161,23 @@ def cut_image(
 
     Parameters
     ----------
-    pixels : array-like of that shape, indexed once with arrays of rows and columns
+    pixels : Pixels or ndarray, shape (h, w)
+        The image, indexed once with arrays of rows and columns.
+    shape : tuple of int
+        Rows and columns of the image.
     x, y : ndarray, shape (n,)
         0-based positions; NaN is off the image.
     stamp_px, margin : int
-        d, and pixels added on every side.
+        Side d of the stamps, and pixels added on every side.
 
     Returns
     -------
-    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin), 0 off the image
-    inside : ndarray of bool, the same shape: the pixel is on the image
-    truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
+    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin)
+        Pixels of the image, 0 off the image.
+    inside : ndarray of bool, shape (n, d + 2·margin, d + 2·margin)
+        True for pixels on the image.
+    truncated : ndarray of bool, shape (n,)
+        True if a pixel of the stamp, margin aside, is off the image.
     """
     # Rows and columns of every stamp in the image.
     side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
@@ -178,7 +185,7 @@ def cut_image(
     columns = central_pixel(x)[:, None] + side
     row_inside: np.ndarray = (rows >= 0) & (rows < shape[0])
     column_inside: np.ndarray = (columns >= 0) & (columns < shape[1])
-    # Pixels off the image are those at its edge first, and 0 then.
+    # Pixels off the image are read at its edge first, then set to 0.
     stamps: np.ndarray = pixels[
         np.clip(rows, 0, shape[0] - 1)[:, :, None], np.clip(columns, 0, shape[1] - 1)[:, None, :]
     ]
@@ -191,7 +198,7 @@ def cut_image(
     return stamps, inside, np.asarray(~is_whole)
 
 
-# The border and what is around it: where there is most sky and least star.
+# The border of a stamp and its surroundings, where the sky is measured.
 
 
 @cache
@@ -209,7 +216,7 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray, shape (n,), float64
-        Median of all good pixels where the border has none; 0 where no pixel is good.
+        Median of all good pixels if the border has no good pixel; 0 if no pixel is good.
     """
     size = (len(stamps), stamps.shape[-1] ** 2)
     flat, hidden = stamps.reshape(size), bad.reshape(size)
@@ -226,17 +233,19 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
 def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
     """Return σ of the pixels in the border of every stamp from their median deviation.
 
-    Light of the star in the border is in it.
+    Light of the star in the border increases it.
 
     Parameters
     ----------
     stamps : ndarray, shape (n, s, s)
+        Stamps, with or without sky.
     bad : ndarray of bool, shape (n, s, s), optional
         Pixels that are left out, unless all are bad.
 
     Returns
     -------
     ndarray, shape (n,)
+        σ of each stamp.
     """
     from astropy.stats import mad_std
 
@@ -245,7 +254,7 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     ring = stamps.reshape(size)[:, border]
     if bad is None:
         return np.asarray(mad_std(ring, axis=1), np.float64)
-    # Bad pixels of the ring are left out, but for stamps of which all of the ring is bad.
+    # Bad pixels of the ring are left out, unless the whole ring is bad.
     hidden = bad.reshape(size)[:, border]
     hidden &= ~hidden.all(axis=1, keepdims=True)
     ring = np.where(hidden, np.nan, ring)
@@ -255,21 +264,22 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
 def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Return median and scatter of the pixels outside the stamps, other stars clipped.
 
-    Without a margin (s < d + 4) the pixels are the outer two rows and columns of the stamp itself;
-    light of the star in them counts as sky then.
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of the stamp itself,
+    in which light of the star is taken for sky.
 
     Parameters
     ----------
     window : ndarray, shape (n, s, s)
+        Stamps with their margins.
     bad : ndarray of bool, shape (n, s, s)
-        Pixels that do not count.
+        Pixels that are ignored.
     stamp_px : int
-        Side d.
+        Side d of the stamps.
 
     Returns
     -------
     level, noise : ndarray, shape (n,)
-        In counts per pixel.
+        Median and σ, in counts per pixel; 0 where all pixels are bad.
     """
     from astropy.stats import sigma_clipped_stats
 
@@ -279,7 +289,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     start = side // 2 - hole_px // 2
     ring = np.ones((side, side), dtype=bool)
     ring[start : start + hole_px, start : start + hole_px] = False
-    # Medians of whole counts are those of the counts before rounding.
+    # Dither whole counts, so that medians are not rounded.
     step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
     window, dither_variance = dither(window, step)
     # Pixels of the ring more than 3 σ off their median belong to other stars.
@@ -288,7 +298,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
         _, level, noise = sigma_clipped_stats(
             window[:, ring], mask=bad[:, ring], sigma=3.0, stdfunc="mad_std", axis=1
         )
-    # Where no pixel counts in any stamp, both are one masked value; 0 stands for no pixel.
+    # If all pixels of all stamps are bad, both are one masked value; bad stamps get 0.
     statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
     statistics = np.nan_to_num(statistics).astype(float)
     level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
@@ -298,18 +308,18 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).
 
 
-def smoothed(stamps: np.ndarray) -> np.ndarray:
-    """Return stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
+def smooth_stamps(stamps: np.ndarray) -> np.ndarray:
+    """Convolve stamps (n, s, s) with [1, 2, 1]/4 along both axes; edge pixels are repeated."""
     # [1, 2, 1] along columns, then along rows; 16 is the sum of the weights.
-    padded = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+    padded_stamps = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    rows = padded_stamps[:, :-2] + 2 * padded_stamps[:, 1:-1] + padded_stamps[:, 2:]
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
 
 
-def softened(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
-    """Return stamps (n, s, s) convolved with a Gaussian of a FWHM, edges repeated; 0 is none.
+def blur_stamps(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
+    """Convolve stamps (n, s, s) with a Gaussian; edges are repeated, a FWHM of 0 changes nothing.
 
-    A ring, or a star that is wide beside its pixels, has its brightest pixel in its middle then.
+    The brightest pixel of a ring, or of a star much wider than a pixel, is then in its middle.
     """
     from scipy import ndimage
 
@@ -320,36 +330,35 @@ def softened(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
 
 
 def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -> np.ndarray:
-    """Return how far each star lies off the place where the training would have put it.
+    """Return the displacement of each star from the range of centring errors of the training.
 
-    The training moves stars by up to `jitter_px` whole pixels, so only a star beyond that is moved.
-    Noise must not move a star, nor may the second peak of an aberrated one: the brightest pixel
-    counts as elsewhere only if the smoothed stamp has its maximum there as well, and well above all
-    of the middle.
+    The training moves stars by up to `jitter_px` whole pixels, so only a star outside this range is
+    moved. Neither noise nor the second peak of an aberrated star must move it: the brightest pixel
+    is used only if the smoothed stamp has its maximum there as well, well above all of the middle.
 
     Parameters
     ----------
     stamps : ndarray, shape (n, s, s)
-        s even; bad pixels at the sky level. The sky need not be subtracted.
+        Stamps of even side, bad pixels at the sky level. The sky need not be subtracted.
     jitter_px : int
-        Distance (per axis) that the training covers.
+        Maximum centring error of the training, in pixels along each axis.
     centring_px : float
-        FWHM of the Gaussian by which the training smoothed stars to find their brightest pixels.
+        FWHM of the Gaussian with which the training smooths stars to find their brightest pixels.
 
     Returns
     -------
     ndarray of int, shape (n, 2)
-        (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie within
-        `jitter_px`, or of which that cannot be said.
+        (row, column) of the brightest pixel from (s/2, s/2); 0 for stars within
+        `jitter_px`, or without a significant peak.
     """
     # Pixels in the middle that the jitter of the training reaches.
     middle = stamps.shape[-1] // 2
     centre = slice(middle - jitter_px, middle + jitter_px + 1)
     # Brightest pixels of the stamps, and of the stamps smoothed once more.
-    soft = softened(stamps, centring_px)
-    smooth = smoothed(soft)
+    soft = blur_stamps(stamps, centring_px)
+    smooth = smooth_stamps(soft)
     brightest, brightest_smooth = (peaks(images) - middle for images in (soft, smooth))
-    # Stars of which both are elsewhere, and agree to a pixel.
+    # Stars whose peaks are both outside the middle, and agree to a pixel.
     agrees = np.abs(brightest - brightest_smooth).max(axis=1) <= 1
     star = np.flatnonzero((np.abs(brightest).max(axis=1) > jitter_px) & agrees)
     offset = np.zeros((len(stamps), 2), dtype=np.int16)
@@ -364,7 +373,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
 
 
 def peaks(images: np.ndarray) -> np.ndarray:
-    """Return (row, column) of the brightest pixel of every image, of equal ones the first."""
+    """Return (row, column) of the brightest pixel of every image, the first of equal ones."""
     flat = images.reshape(len(images), -1).argmax(axis=1)
     return np.stack(np.divmod(flat, images.shape[-1]), axis=1)
 
@@ -375,14 +384,16 @@ def cut(window: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> 
     Parameters
     ----------
     window : ndarray, shape (n, s, s)
+        Larger stamps, s ≥ d.
     stamp_px : int
-        Side d.
+        Side d of the stamps.
     offset : ndarray of int, shape (n, 2), optional
-        (row, column); none by default. What would lie beyond the window repeats its edge.
+        (row, column), 0 by default. Pixels outside the window repeat its edge.
 
     Returns
     -------
     ndarray, shape (n, d, d)
+        The stamps.
     """
     side = window.shape[-1]
     # Stamps without an offset are the middle of the window.
@@ -390,7 +401,7 @@ def cut(window: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> 
     middle = window[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
     if offset is None or not offset.any():
         return np.ascontiguousarray(middle)
-    # Only stars with an offset are cut by themselves.
+    # Only stars with an offset are cut one by one.
     star = np.flatnonzero(offset.any(axis=1))
     stamps = middle.copy()
     rows, columns = (np.clip(offset[star, i, None] + pixels, 0, side - 1) for i in (0, 1))

@@ -1,7 +1,7 @@
-"""Criteria for stars that are good enough to learn the PSF from.
+"""Criteria for stars that are good enough to train a PSF model on.
 
-In: measurements and stamps of n stars, (n,) and (n, s, s); the star of a stamp lies near index
-(s//2, s//2). Out: one value for each star. `selection` applies them.
+Inputs: measurements (n,) and stamps (n, s, s) of n stars; each star is near index (s//2, s//2).
+Output: one value for each star. `selection` applies the criteria.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from itertools import repeat
 import numpy as np
 import scipy
 
-from psfdae.image.stamps import cut, peaks, softened
+from psfdae.image.stamps import blur_stamps, cut, peaks
 from psfdae.stars.moments import robust_scatter
 
 # Brightness.
@@ -21,18 +21,18 @@ from psfdae.stars.moments import robust_scatter
 def stamp_snr(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
 
-    For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with
-    the noise-equivalent area A = 1/Σp² is what stays (King 1983, PASP 95, 163). No
-    PSF has to be known. 0 where the noise is 0.
+    For an image x = F p of P pixels the expectation of Σx² is F²Σp² + Pσ², so the result is
+    F/(σ √A) with the noise-equivalent area A = 1/Σp² (King 1983, PASP 95, 163). The PSF need not
+    be known. The S/N is 0 where the noise is 0.
 
     Parameters
     ----------
     stamps : ndarray, shape (n, d, d)
-        Sky-subtracted.
+        Sky-subtracted stamps.
     noise : ndarray, shape (n,)
-        RMS σ of a pixel.
+        RMS noise σ of a pixel.
     """
-    # Noise alone has Σx²/σ² = P; a sum below that is no star.
+    # Noise alone has Σx²/σ² = P; a smaller sum has an S/N of 0.
     power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
     safe = np.where(noise > 0, noise, np.inf)
     return np.asarray(np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0)))
@@ -46,51 +46,52 @@ def brightest_pixels(
     Parameters
     ----------
     stamps : ndarray, shape (n, s, s)
+        Sky-subtracted stamps.
     search_px : int
-        Searched within ± this of the middle.
+        Half width of the search window about the middle.
     centring_px : float
-        FWHM of the Gaussian that smooths the stamps before; 0: none.
+        FWHM in px of the Gaussian that smooths the stamps first; 0: none.
 
     Returns
     -------
     peak : ndarray of int, shape (n, 2)
-        (row, column) from index (s//2, s//2).
+        (row, column) of the brightest pixel from index (s//2, s//2).
     inside : ndarray of bool, shape (n,)
         True if no pixel just outside the search window is brighter.
     """
-    # One pixel more on each side, in which a star that is elsewhere has its brightest pixel.
+    # One more pixel on each side shows stars whose brightest pixel is outside the window.
     middle, reach = stamps.shape[-1] // 2, search_px + 1
     window = slice(middle - reach, middle + reach + 1)
-    peak = peaks(softened(stamps, centring_px)[:, window, window]) - reach
+    peak = peaks(blur_stamps(stamps, centring_px)[:, window, window]) - reach
     return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
 
 
-def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
-    """Return the counts from which brightest pixels of stars pile up; infinite if none do.
+def find_pile_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
+    """Return the counts at which brightest pixels of stars pile up; infinite if none do.
 
-    Stars of the same brightness have the same brightest pixels, too. Of those that are cut
-    off, the brightest pixel is less of the star than in others.
+    Stars of the same brightness have the same brightest pixels, too. In stars that are cut off, the
+    brightest pixel is a smaller part of the star than in others.
 
     Parameters
     ----------
     brightest : ndarray, shape (n,)
-        Pixel of every star, counts, sky included.
+        Brightest pixel of every star in counts, sky included.
     sky, brightness : ndarray, shape (n,)
         Level in counts, and light of the star in any unit.
     """
     height = brightest - sky
     top = height.max(initial=0.0)
     # Three stars or more whose brightest pixels agree within 3 %, and fainter ones to compare with.
-    piled = height >= 0.97 * top
-    fainter = (height >= 0.1 * top) & ~piled
-    if top <= 0 or piled.sum() < 3 or not fainter.any():
+    is_piled = height >= 0.97 * top
+    fainter = (height >= 0.1 * top) & ~is_piled
+    if top <= 0 or is_piled.sum() < 3 or not fainter.any():
         return np.inf
-    # Cut off, they are less of their star than in fainter stars, by a tenth.
+    # If cut off, they are a smaller part of their star than in fainter stars, by a tenth.
     sharpness = height / np.where(brightness > 0, brightness, 1.0)
-    if np.median(sharpness[piled]) > 0.9 * np.median(sharpness[fainter]):
+    if np.median(sharpness[is_piled]) > 0.9 * np.median(sharpness[fainter]):
         return np.inf
-    # Six digits, rounded down, so that a level that is printed is the one that is meant.
-    level = float(brightest[piled].min())
+    # Six digits, rounded down, so that the printed level is the exact one.
+    level = float(brightest[is_piled].min())
     unit = 10.0 ** (np.floor(np.log10(level)) - 5) if level > 0 else 1.0
     return float(f"{np.floor(level / unit * (1 + 1e-12)) * unit:.6g}")
 
@@ -98,7 +99,7 @@ def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> 
 # Neighbours.
 
 
-def crowded(
+def find_crowded(
     position: np.ndarray, brightness: np.ndarray, distance_px: float, ratio: float
 ) -> np.ndarray:
     """Return True for stars with a neighbour of at least `ratio` of their brightness nearby, (n,).
@@ -106,27 +107,29 @@ def crowded(
     Parameters
     ----------
     position : ndarray, shape (n, 2)
-        In pixels; a star at NaN has no neighbours.
+        Positions in pixels; a star at NaN has no neighbours.
     brightness : ndarray, shape (n,)
+        Brightness of the stars in any linear unit.
     distance_px, ratio : float
+        Maximum distance of a neighbour, and its minimum brightness over the brightness of the star.
     """
-    # Each pair both ways round.
-    located = np.flatnonzero(np.isfinite(position).all(axis=1))
+    # Each pair in both orders.
+    indices = np.flatnonzero(np.isfinite(position).all(axis=1))
     is_crowded = np.zeros(len(position), dtype=bool)
-    tree = scipy.spatial.cKDTree(position[located])
-    pairs = located[tree.query_pairs(distance_px, output_type="ndarray")]
+    tree = scipy.spatial.cKDTree(position[indices])
+    pairs = indices[tree.query_pairs(distance_px, output_type="ndarray")]
     for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
         is_crowded[first[brightness[second] >= ratio * brightness[first]]] = True
     return is_crowded
 
 
-def overlapping(position: np.ndarray, side: int) -> float:
-    """Return the part of the stars (n, 2) in whose stamps of a side another one stands."""
+def measure_overlap(position: np.ndarray, side: int) -> float:
+    """Return the part of the stars (n, 2) whose stamps of a side contain another star."""
     # Distance of the nearest other star along the farther axis, as stamps are squares.
-    located = position[np.isfinite(position).all(axis=1)]
-    if len(located) < 2:
+    finite = position[np.isfinite(position).all(axis=1)]
+    if len(finite) < 2:
         return 0.0
-    distance, _ = scipy.spatial.cKDTree(located).query(located, k=2, p=np.inf)
+    distance, _ = scipy.spatial.cKDTree(finite).query(finite, k=2, p=np.inf)
     return float((distance[:, 1] < 0.5 * side).mean())
 
 
@@ -136,8 +139,8 @@ def overlapping(position: np.ndarray, side: int) -> float:
 def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     """Return which sources (n,) have a far smaller noise-equivalent area than the median source.
 
-    Less than half of it, and less by more than five times the scatter: that of stars changes with
-    the place in the field, and with the phase on the pixel grid where stars are narrow.
+    It is less than half of the median, and less by more than five times the scatter: the area of
+    stars changes over the field, and with the phase on the pixel grid where stars are narrow.
     """
     if len(area) < 4:
         return np.zeros(len(area), dtype=bool)
@@ -150,32 +153,32 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
 def wider_than_stars(area: np.ndarray, position: np.ndarray, size_error: np.ndarray) -> np.ndarray:
     """Return which sources have a far larger noise-equivalent area than the stars around them.
 
-    Stars have nearly one size, other sources any: of the logarithms of all areas, each less the
-    lower quartile of those of its nearest sources, the stars are the shortest interval that has a
-    quarter of them. Sources above it by a factor of 1.5, and by more than five times the scatter
-    that the interval implies, are no stars; the interval is then searched again. Where the PSF
-    changes over the field, so do the sources around.
+    Stars have nearly one size, other sources any size. Of the logarithms of all areas, each less
+    the lower quartile of its nearest sources, the shortest interval that has a quarter of them
+    gives the stars. Sources above it by a factor of 1.5, and by more than five times the scatter
+    that the interval implies, are rejected; the interval is then searched again. Where the PSF
+    changes over the field, so do the nearest sources.
 
-    Where the sources that are left have many sizes even so, most are galaxies. The stars are then
-    the narrowest group of bright sources of one size, and a source is a star only if its size is
-    known well enough to say so.
+    If the remaining sources still have many sizes, most are galaxies. The stars are then the
+    narrowest group of bright sources of one size, and a source is a star only if its size is known
+    well enough.
 
     Parameters
     ----------
     area : ndarray, shape (n,)
         Noise-equivalent areas in pixels.
     position : ndarray, shape (n, 2)
-        In the image; all sources are near where one is not finite.
+        (x, y) in the image; if one is not finite, all sources are neighbours of each other.
     size_error : ndarray, shape (n,)
         Standard error of the logarithm of the area.
     """
-    # With fewer than four sources there is no locus to see, with fewer than eight a rough one.
+    # Fewer than four sources show no locus of stars, fewer than eight a rough one.
     is_wide = np.zeros(len(area), dtype=bool)
     if len(area) < 4:
         return is_wide
     size, factor = np.log(area), 1.5 if len(area) >= 8 else 3.0
     for _ in range(10):
-        # The locus is searched among those that are not yet known to be wide.
+        # The locus is searched among the sources that are not yet rejected.
         star = np.flatnonzero(~is_wide)
         if len(star) < 4:
             break
@@ -220,8 +223,8 @@ def shortest_interval(values: np.ndarray) -> tuple[float, float]:
 def has_many_sizes(size: np.ndarray, position: np.ndarray, size_error: np.ndarray) -> bool:
     """Return True if sources differ in size more than stars do, also of a PSF that changes.
 
-    ln A of stars scatters by 0.25 at most about the sizes of their neighbours, and that of bright
-    stars about a plane over the image; ln A of galaxies by 0.4 and more.
+    ln A of stars scatters by 0.25 at most about the sizes of their neighbours, and ln A of bright
+    stars about a plane over the image; ln A of galaxies scatters by 0.4 and more.
 
     Parameters
     ----------
@@ -230,7 +233,7 @@ def has_many_sizes(size: np.ndarray, position: np.ndarray, size_error: np.ndarra
     position : ndarray, shape (n, 2)
         (x, y) in the image, NaN where unknown.
     """
-    # With fewer than ten sources, neighbours and a plane say nothing.
+    # With fewer than ten sources, neighbours and a plane are not significant.
     excess, is_sharp = size - size_around(size, position, position), size_error < 0.1
     if np.count_nonzero(is_sharp) < 10 or shortest_interval(excess)[1] < 0.2:
         return False
@@ -250,7 +253,7 @@ def narrowest_group(size: np.ndarray) -> tuple[float, float]:
     Parameters
     ----------
     size : ndarray, shape (n,)
-        ln A of sources of which it is known to a tenth.
+        ln A of sources, with standard errors below 0.1.
     """
     # Four sources or more within 3 % in diameter, or the four that are nearest to this.
     ascending = np.sort(size)
@@ -262,33 +265,33 @@ def narrowest_group(size: np.ndarray) -> tuple[float, float]:
 
 
 def misfit(
-    aligned: np.ndarray, position: np.ndarray, noise: np.ndarray, companions: int = 12
+    aligned_stamps: np.ndarray, position: np.ndarray, noise: np.ndarray, companions: int = 12
 ) -> np.ndarray:
-    """Return how unlike its neighbours each star is, in what is usual in this image, shape (n,).
+    """Return how unlike its neighbours each star is, relative to the median star, shape (n,).
 
-    A star is compared with the nearest stars, pixel by pixel: its
-    difference from their median in units of their robust scatter, root mean square
-    over the stamp, or over the worst 3 × 3 pixels of its core: a close companion and a core that is
-    flat or hollow are no more than that. Where the PSF varies, so do the neighbours; a
-    companion or a cosmic ray lies where they agree. The median star has 1, in its worst
-    pixels 1/1.2, because the worst pixels of good stars scatter more than their stamps as a whole.
+    A star is compared with the nearest stars, pixel by pixel: its difference from their median in
+    units of their robust scatter, as a root mean square over the stamp, or over the worst 3 × 3
+    pixels of its core, which reveal a close companion or a flat or hollow core. Where the PSF
+    varies, so do the neighbours; a companion or a cosmic ray lies where they agree. The median star
+    has 1, in its worst pixels 1/1.2, because the worst pixels of good stars scatter more than their
+    stamps as a whole.
 
     Parameters
     ----------
-    aligned : ndarray, shape (n, d, d)
-        Of flux 1, moved to a common centre.
+    aligned_stamps : ndarray, shape (n, d, d)
+        Stars of flux 1, moved to a common centre.
     position : ndarray, shape (n, 2)
-        In the image; all stars are neighbours where a position is not finite.
+        (x, y) in the image; if one is not finite, all stars are neighbours of each other.
     noise : ndarray, shape (n,)
         RMS of a pixel over the flux.
     companions : int
         Number of nearest stars with which a star is compared.
     """
-    count, side = len(aligned), aligned.shape[-1]
+    count, side = len(aligned_stamps), aligned_stamps.shape[-1]
     if count < 4:
         return np.ones(count)
 
-    def expected(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def compute_statistics(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return median and robust variance of every pixel of some stars, (d, d) each."""
         scatter = robust_scatter(stars)
         # A dozen stars may agree in a pixel by chance.
@@ -299,15 +302,15 @@ def misfit(
     if np.isfinite(position).all() and count > companions:
         neighbours = scipy.spatial.cKDTree(position).query(position, k=companions + 1)[1]
         companion_rows = (rows[rows != star] for star, rows in enumerate(neighbours))
-        local_medians = (expected(aligned[rows]) for rows in companion_rows)
+        local_medians = (compute_statistics(aligned_stamps[rows]) for rows in companion_rows)
     else:
-        local_medians = repeat(expected(aligned), count)
-    # Half of the stamp, or 8 px if that is more: farther out is no place for a faint neighbour.
+        local_medians = repeat(compute_statistics(aligned_stamps), count)
+    # Half of the stamp, at least 8 px: faint neighbours farther out do not matter.
     core_px = min(side, max(side // 2, 8))
     score = np.empty((count, 2))
     for star, (median, variance) in enumerate(local_medians):
         # χ² of each pixel; its mean, and the largest mean of 3 × 3 pixels.
-        square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
+        square = (aligned_stamps[star] - median) ** 2 / (variance + noise[star] ** 2)
         patches = scipy.ndimage.uniform_filter(square, 3)[None]
         score[star] = square.mean(), cut(patches, core_px).max()
     score = np.sqrt(score)

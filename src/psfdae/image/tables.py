@@ -1,7 +1,7 @@
 """Tables of stars: names, units and digits of their columns, and how they are written.
 
 `psfdae predict`, `psfdae photometry`, `Stars.table` and `Prediction.to_table` all give the table of
-`star_table`; `COLUMNS` says what each of their columns is.
+`star_table`; `COLUMNS` describes each of their columns.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from psfdae.base.types import BinTableHDU, Column, QTable, Table
 from psfdae.image.containers import fits_unit
 from psfdae.image.errors import ascii_line, silent
 
-OF_IMAGE = "unit of the image"
-"""Stands in `COLUMNS` for the unit of the image's pixels."""
+PIXEL_UNIT = "unit of the image"
+"""Placeholder in `COLUMNS` for the unit of the image's pixels."""
 
 COLUMNS: dict[str, tuple[str, str, str]] = {
     "image": ("", "", "file of the exposure"),
@@ -31,14 +31,14 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "dec": ("deg", ".8f", "ICRS, of the fitted centre if there is one"),
     "verdict": ("", "", "good, or why the star is not used for training"),
     "part": ("", "", "training, or held out"),
-    "flux": (OF_IMAGE, ".7g", "light of the star; of predict, that in its stamp"),
-    "flux_error": (OF_IMAGE, ".3g", "standard error; NaN if the flux was given"),
-    "flux_total": (OF_IMAGE, ".7g", "within FLUXRAD; NaN if the model has no wings"),
-    "flux_total_error": (OF_IMAGE, ".3g", "standard error"),
-    "flux_model": (OF_IMAGE, ".7g", "light of the star within the model's stamp"),
-    "flux_iso": (OF_IMAGE, ".7g", "light above the threshold of the detection"),
-    "background": (OF_IMAGE, ".6g", "sky per pixel"),
-    "noise": (OF_IMAGE, ".4g", "RMS of the sky noise in a pixel"),
+    "flux": (PIXEL_UNIT, ".7g", "light of the star; of predict, that in its stamp"),
+    "flux_error": (PIXEL_UNIT, ".3g", "standard error; NaN if the flux was given"),
+    "flux_total": (PIXEL_UNIT, ".7g", "within FLUXRAD; NaN if the model has no wings"),
+    "flux_total_error": (PIXEL_UNIT, ".3g", "standard error"),
+    "flux_model": (PIXEL_UNIT, ".7g", "light of the star within the model's stamp"),
+    "flux_iso": (PIXEL_UNIT, ".7g", "light above the threshold of the detection"),
+    "background": (PIXEL_UNIT, ".6g", "sky per pixel"),
+    "noise": (PIXEL_UNIT, ".4g", "RMS of the sky noise in a pixel"),
     "snr": ("", ".1f", "of a matched filter, flux sqrt(sum of PSF^2) / noise"),
     "mag": ("mag", ".4f", "zero point - 2.5 log10(flux)"),
     "mag_error": ("mag", ".4f", "standard error"),
@@ -54,7 +54,7 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "y_fit": ("pix", ".4f", "centre of the star, rows, 0-based"),
     "x_error": ("pix", ".3g", "standard error of x_fit, or of x"),
     "y_error": ("pix", ".3g", "standard error of y_fit, or of y"),
-    "background_error": (OF_IMAGE, ".3g", "standard error of background"),
+    "background_error": (PIXEL_UNIT, ".3g", "standard error of background"),
     **{
         f"corr_{pair}": ("", ".3f", "correlation of errors")
         for pair in ("flux_background", "flux_y", "flux_x", "background_y", "background_x", "y_x")
@@ -69,75 +69,76 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
 """Unit, format in which values are shown, and meaning of each column, by its name."""
 
 SUFFIXES = (".fits", ".ecsv", ".csv")
-"""Ends of the names of files that `write_table` writes."""
+"""Suffixes of files that `write_table` writes."""
 
 
 def star_table(
-    columns: Mapping[str, np.ndarray], image_unit: str = "", of_list: Table | None = None
+    columns: Mapping[str, np.ndarray], image_unit: str = "", star_list: Table | None = None
 ) -> QTable:
     """Return a table of n stars with units, and further columns of their star list.
 
     Parameters
     ----------
     columns : mapping of str to ndarray, shape (n,)
-        By names of `COLUMNS`, in this order; names that are not there have neither unit nor
-        meaning.
+        Columns by their names, in this order; names that are not in `COLUMNS` have neither unit
+        nor meaning.
     image_unit : str
-        Unit of the image's pixels; "" where nothing says it, which is taken for adu.
-    of_list : Table, optional
-        n rows of the star list. Its columns come after the others. One whose name is taken, upper
-        and lower case being the same, gets `_list` at its end.
+        Unit of the image's pixels; "" where it is unknown, which is taken for adu.
+    star_list : Table, optional
+        n rows of the star list. Its columns follow the others; `_list` is added to names that
+        exist already, in any case.
     """
     from astropy.table import QTable
     from astropy.units import Quantity, Unit
 
-    # Columns with units, as they are shown, and what they mean.
+    # Columns with units, formats and meanings.
     table = QTable()
     for name, values in columns.items():
         unit, form, meaning = COLUMNS.get(name, ("", "", ""))
-        # Units that no standard has are kept as they are.
-        text = (image_unit or "adu") if unit == OF_IMAGE else unit
+        # Unknown units are kept unchanged.
+        text = (image_unit or "adu") if unit == PIXEL_UNIT else unit
         column_unit = Unit(text, parse_strict="silent")
         table[name] = Quantity(values, column_unit, dtype=values.dtype) if unit else values
         table[name].info.description = meaning
         if form:
             table[name].info.format = form
-    if of_list is None:
+    if star_list is None:
         return table
     # Columns of the list behind them, under names of their own.
-    for name in of_list.colnames:
+    for name in star_list.colnames:
         column_name, names = name, {column.lower() for column in table.colnames}
         while column_name.lower() in names:
             column_name += "_list"
         with silent():  # a unit that suits no quantity leaves a plain column
-            table[column_name] = of_list[name]
+            table[column_name] = star_list[name]
     return table
 
 
-def table_of_rows(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Table:
-    """Return a table of rows that have the same keys; real numbers are shown in a format.
+def rows_to_table(rows: Sequence[Mapping[str, object]], form: str = ".4g") -> Table:
+    """Build a table from rows that have the same keys; real numbers are shown in a format.
 
     Parameters
     ----------
     rows : sequence of mappings
-        At least one.
+        Values by column name, of at least one row.
     form : str
         Format in which real numbers are shown; all digits are kept.
     """
     from astropy.table import Table
 
-    # Columns stand in the order of the keys of the first row.
-    return with_format(Table({name: [row[name] for row in rows] for name in rows[0]}), form)
+    # Columns have the order of the keys of the first row.
+    return set_format(Table({name: [row[name] for row in rows] for name in rows[0]}), form)
 
 
-def with_format(table: Table, form: str = ".4g") -> Table:
-    """Return the table with a format in which its real numbers are shown; all digits are kept.
+def set_format(table: Table, form: str = ".4g") -> Table:
+    """Set the format in which a table's real numbers are shown; all digits are kept.
 
     Parameters
     ----------
     table : Table
-        Its columns get the format.
+        Table whose columns get the format.
     form : str
+        Format in which real numbers are shown, such as ".4g".
     """
     for column in table.itercols():
         if column.dtype.kind == "f":
@@ -146,10 +147,10 @@ def with_format(table: Table, form: str = ".4g") -> Table:
 
 
 def fits_values(column: Column) -> np.ndarray:
-    """Return a column of a table as a FITS table holds it, shape (n,).
+    """Return a column of a table with types of FITS tables, shape (n,).
 
-    Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
-    that are missing are NaN, whole ones the least of their type.
+    Text is ASCII, as wide as the column, with question marks for other characters. Missing
+    real numbers are NaN, missing whole numbers the minimum of their type.
 
     Parameters
     ----------
@@ -157,33 +158,33 @@ def fits_values(column: Column) -> np.ndarray:
         Numbers or text, perhaps masked, perhaps with a unit, which is left out.
     """
     # Values without mask and unit, and which of them are missing.
-    unmasked = getattr(column, "unmasked", column)
-    values = np.ma.getdata(np.asarray(getattr(unmasked, "value", unmasked)))
+    unmasked_column = getattr(column, "unmasked", column)
+    values = np.ma.getdata(np.asarray(getattr(unmasked_column, "value", unmasked_column)))
     is_missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
     # Characters of four bytes become one byte each.
     if values.dtype.kind in "US":
         width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
         texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
-        encoded = [v if isinstance(v, bytes) else v.encode("ascii", "replace") for v in texts]
-        return np.array(encoded, dtype=f"S{width}")
+        encoded_texts = [v if isinstance(v, bytes) else v.encode("ascii", "replace") for v in texts]
+        return np.array(encoded_texts, dtype=f"S{width}")
     # FITS has 16, 32 and 64 bits of whole numbers with a sign, 32 and 64 of real ones.
     if values.dtype.kind == "u" or values.dtype == np.int8:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
     elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
         values = values.astype(np.float64)
-    # FITS has no masks: a value stands for a missing one.
+    # FITS lacks masks: a value represents missing ones.
     if is_missing.any():
         values = np.where(is_missing, _missing(values.dtype), values).astype(values.dtype)
     return values
 
 
 def _missing(dtype: np.dtype) -> Any:
-    """Return what stands for a missing value in FITS.
+    """Return the value that represents a missing value in FITS.
 
     Parameters
     ----------
     dtype : dtype
-        Type of the column: NaN for real numbers, the least whole number, False for truth values.
+        Type of the column: NaN for real numbers, the minimum for whole numbers, else False.
     """
     if dtype.kind == "f":
         return np.nan
@@ -196,6 +197,7 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
     Parameters
     ----------
     table : QTable
+        Table with units and meanings, as of `star_table`.
     name : str
         Name of the extension.
     """
@@ -210,7 +212,7 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
     with silent():
         hdu = fits.table_to_hdu(plain)
     hdu.name = name
-    # Unit, value that stands for a missing one, and meaning of each column.
+    # Unit, value of missing entries, and meaning of each column.
     for number, column in enumerate(table.colnames, start=1):
         info = table[column].info
         if info.unit is not None and str(info.unit):
@@ -225,24 +227,25 @@ def as_fits(table: QTable, name: str) -> BinTableHDU:
 
 
 def write_table(path: Path, table: QTable) -> None:
-    """Write a table of stars to a file, in the format that the end of its name says.
+    """Write a table of stars to a file, in the format of its suffix.
 
-    FITS and ECSV have all digits, CSV those that are shown. In CSV, no text is a formula to a
-    spreadsheet. A real number that is missing is `nan` there, so that readers need no mask, and any
-    other value that is missing an empty cell.
+    FITS and ECSV have all digits, CSV the digits that are shown. In CSV, texts cannot be formulas
+    of a spreadsheet. A missing real number is `nan` there, so that readers need no mask, and any
+    other missing value an empty cell.
 
     Parameters
     ----------
     path : Path
-        Its name ends in one of `SUFFIXES`.
+        File whose name ends in one of `SUFFIXES`.
     table : QTable
+        Table with units and meanings, as of `star_table`.
     """
     from astropy.io import ascii as text_tables
     from astropy.io import fits
     from astropy.table import Table
 
     plain = Table(table)  # columns with units in place of quantities
-    # Into memory first: astropy does not name the file for which a disk has no space.
+    # Into memory first: astropy does not name the file if a disk is full.
     content, text = io.BytesIO(), io.StringIO()
     with silent():
         if path.suffix.lower() == ".fits":
@@ -256,7 +259,7 @@ def write_table(path: Path, table: QTable) -> None:
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
             plain.rename_columns(plain.colnames, [*map(no_formula, plain.colnames)])
-            # Formats are those of the columns; numbers that are missing are written as such.
+            # Numbers have the format of their column; missing ones are written as NaN.
             for column in [*plain.columns.values()]:
                 if column.dtype.kind == "f" and hasattr(column, "filled"):
                     plain[column.name] = column.filled(np.nan)
@@ -265,12 +268,14 @@ def write_table(path: Path, table: QTable) -> None:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML; cells of the rows are HTML, those of the head are text.
+    """Return a table of HTML; cells of the rows are HTML, cells of the head are text.
 
     Parameters
     ----------
     head : sequence of str, length k
+        Titles of the columns, which are escaped.
     rows : sequence of sequences of str, length k each
+        Cells of each row, which are not escaped.
     """
     # Head, then a line for each row.
     cells = "".join(f"<th>{escape(name)}</th>" for name in head)

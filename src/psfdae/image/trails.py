@@ -1,6 +1,6 @@
 """Trails of satellites and aeroplanes, and spikes of saturated stars: straight and narrow light.
 
-In: an image and its bad pixels. Out: bad pixels with those of trails and spikes.
+Inputs: an image and its bad pixels. Output: bad pixels, with trails and spikes added.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ class Line(NamedTuple):
     distance_px: float
 
     def across(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the signed distance of places from the line, px."""
+        """Return the signed distance of positions from the line, px."""
         across = x * np.sin(self.angle_rad) - y * np.cos(self.angle_rad)
         return np.asarray(across - self.distance_px)
 
     def along(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the place along the line, px."""
+        """Return the position along the line, px."""
         return np.asarray(x * np.cos(self.angle_rad) + y * np.sin(self.angle_rad))
 
 
 def add_trails(
     image: np.ndarray, bad_pixels: BadPixels, saturate: float | None = None
 ) -> BadPixels:
-    """Return the bad pixels of an image (h, w) with those of trails and spikes.
+    """Add the pixels of trails and spikes to the bad pixels of an image (h, w).
 
-    Without a trail, they are returned with the sky of the image, which was measured to find one,
-    unless the image is so large that its means over squares were searched. They are returned as
-    they are if no sky can be measured, or if the image is smaller than a trail.
+    Without a trail, they are returned with the sky of the image, which was measured for the search,
+    unless the image is so large that its means over squares were searched. They are returned
+    unchanged if no sky can be measured, or if the image is smaller than a trail.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
-        Finite, in the unit of `saturate`.
+        Finite pixels, in the unit of `saturate`.
     bad_pixels : BadPixels
         Bad pixels of other kinds, which are left out of the search.
     saturate : float, optional
@@ -61,7 +61,7 @@ def add_trails(
     if size > 1:
         values = block_reduce(np.where(hidden, np.nan, image), size, np.nanmean)
         hidden = np.isnan(values)
-    # Saturated cores stay as they are, so that these stars are known to be saturated.
+    # Saturated cores stay unchanged, so that these stars are flagged as saturated.
     is_saturated = (values >= saturate) & ~hidden if saturate else np.zeros_like(hidden)
     is_core = scipy.ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
     values = np.where(hidden, 0.0, values)
@@ -76,7 +76,7 @@ def add_trails(
     mask, notes = bad_pixels.mask.copy(), list(bad_pixels.notes)
     words = "a trail" if number == 1 else f"{number} trails"
     for squares, kind in (spikes, "spikes of saturated stars"), (trails, f"{words} of satellites"):
-        # From squares back to pixels; those of the last rows and columns are in none.
+        # From squares back to pixels; the last rows and columns may be in no square.
         large = block_replicate(squares, size, conserve_sum=False)
         new = np.pad(large, [(0, n - m) for n, m in zip(mask.shape, large.shape, strict=True)])
         new &= ~mask
@@ -89,10 +89,10 @@ def add_trails(
 def find_spikes(
     image: np.ndarray, bad: np.ndarray, sky: SkyLevel, is_saturated: np.ndarray
 ) -> np.ndarray:
-    """Find light that runs straight outwards from the cores of saturated stars.
+    """Find straight and narrow light that starts at the cores of saturated stars.
 
-    These are the spikes of diffraction, of any number and direction, and the charge that runs
-    along columns: along a ray from the core, they are brighter than the halo for at least 24 px.
+    These are diffraction spikes, in any number and direction, and charge that bleeds along
+    columns: along a ray from the core, they are brighter than the halo for at least 24 px.
 
     Parameters
     ----------
@@ -104,6 +104,7 @@ def find_spikes(
     Returns
     -------
     ndarray of bool, shape (h, w)
+        True for pixels of spikes.
     """
     from astropy.nddata import overlap_slices
     from skimage.transform import warp_polar
@@ -144,14 +145,14 @@ def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
     """Return middles and radii of the cores of saturated stars: x, y and r in px, (k, 3).
 
     A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The middle
-    is where it is widest, wherever its charge runs.
+    is its widest point, in whatever direction its charge bleeds.
     """
     label, _ = scipy.ndimage.label(is_saturated, np.ones((3, 3)))
     boxes, area = scipy.ndimage.find_objects(label), np.bincount(label.ravel())[1:]
     largest = np.argsort(-area, kind="stable")[: min(50, np.count_nonzero(area >= 4))]
     cores = np.empty((len(largest), 3))
     for core, index in zip(cores, largest, strict=True):
-        # Distance of each pixel from the edge of the core; those as far as the farthest.
+        # Distance of each pixel from the edge of the core; the mean of the farthest ones.
         core_mask = np.pad(label[boxes[index]] == index + 1, 1)
         depth = scipy.ndimage.distance_transform_edt(core_mask)[1:, 1:]
         row, column = np.argwhere(depth == depth.max()).mean(axis=0)
@@ -170,14 +171,16 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Finite pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels that are left out of the search.
     sky : SkyLevel
         Sky of the image.
 
     Returns
     -------
     mask : ndarray of bool, shape (h, w)
+        True for pixels of trails.
     count : int
         Number of trails.
     """
@@ -219,13 +222,13 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
     Returns
     -------
     Line
-        Least squares on the pixels within 3 px of the line that has most of them.
+        Least-squares fit to the pixels within 3 px of the line that has most of them.
     """
     # Number of pixels in strips of 2 px, for lines of all directions.
     line, most_pixels = Line(0.0, 0.0), 0
-    thinned = np.s_[:: max(1, len(x) // 5000)]
+    sample = np.s_[:: max(1, len(x) // 5000)]
     for angle in np.deg2rad(np.arange(0.0, 180.0, 0.5)):
-        across = Line(float(angle), 0.0).across(x[thinned], y[thinned])
+        across = Line(float(angle), 0.0).across(x[sample], y[sample])
         count, edge = np.histogram(across, max(1, int(np.ptp(across) / 2.0)))
         if count.max() > most_pixels:
             most_pixels = int(count.max())
@@ -238,23 +241,24 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
             break
         # A line that is turned by −arctan(slope) follows the pixels; its distance is their mean.
         slope, _ = np.polyfit(along[is_near], across[is_near], 1)
-        turned = Line(line.angle_rad - float(np.arctan(slope)), 0.0)
-        line = turned._replace(distance_px=float(np.mean(turned.across(x[is_near], y[is_near]))))
+        central = Line(line.angle_rad - float(np.arctan(slope)), 0.0)
+        line = central._replace(distance_px=float(np.mean(central.across(x[is_near], y[is_near]))))
     return line
 
 
 def trail_on_line(
     line: Line, flat: np.ndarray, noise: np.ndarray, shortest_px: int
 ) -> np.ndarray | None:
-    """Return the pixels (h, w) of the trail on a line; None if there is none.
+    """Return the pixels (h, w) of the trail on a line; None without a trail.
 
     Parameters
     ----------
     line : Line
+        The line on which a trail is searched.
     flat, noise : ndarray, shape (h, w)
         Smoothed image without its sky, and its σ.
     shortest_px : int
-        Least length of a trail.
+        Minimum length of a trail.
     """
     # Pixels within 21 px of the line, and those in the middle of it.
     height, width = flat.shape
@@ -262,7 +266,7 @@ def trail_on_line(
     light, ring = flat[row, column], np.abs(line.across(column, row))
     along = line.along(column, row)
     middle = ring < 1.0
-    # Parts of the line, 8 px long, with a mean S/N of 2 in the middle: it is that of smoothed
+    # Parts of the line, 8 px long, with a mean S/N of 2 in the middle: the S/N is of smoothed
     # pixels, of which a mean has half the noise.
     part_px = 8
     part = ((along - along.min()) / part_px).astype(int)
@@ -270,8 +274,8 @@ def trail_on_line(
     snr = light[middle] / noise[row, column][middle]
     is_bright = (np.bincount(part[middle], snr) > 2.0 * pixels) & (pixels > 0)
     # The longest run of these, gaps of two parts closed.
-    closed = (np.convolve(np.pad(is_bright, 2), np.ones(3), "same") > 0)[2:-2]
-    edges = np.flatnonzero(np.diff(np.pad(closed.astype(np.int8), 1)))
+    has_light = (np.convolve(np.pad(is_bright, 2), np.ones(3), "same") > 0)[2:-2]
+    edges = np.flatnonzero(np.diff(np.pad(has_light.astype(np.int8), 1)))
     if not edges.size:
         return None
     longest = int((edges[1::2] - edges[::2]).argmax())
@@ -286,7 +290,7 @@ def trail_on_line(
     low, high = np.percentile(np.hstack([heights[:-1], heights[1:]]), [15, 85], axis=1)
     if np.median(low / np.maximum(high, 1e-30)) < 0.3:
         return None
-    # Half width: to where the median height is no more than half the noise of a pixel, σ/2 = 1.5
+    # Half width: the distance at which the median height is half the noise of a pixel, σ/2 = 1.5
     # σ/3; a trail is narrower than 40 px, and than a tenth of its length, or it is a filament of a
     # nebula.
     inside = (part >= start) & (part < end)

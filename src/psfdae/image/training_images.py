@@ -1,13 +1,12 @@
-"""Stars of an image as training data: bright ones are what the faint ones look like.
+"""Stars of an image as training data: bright stars are examples of the faint ones.
 
-In: bright stars (`selection`) and which of them are held out. Out: images of them for the training
-and the test of methods, and their templates.
+Inputs: bright stars (`selection`), and which of them are held out. Outputs: images of these stars
+for the training and the test of methods, and their templates.
 
-A bright star is its own template. Moved by fractions of a pixel it is seen at every
-phase of the pixel grid, moved by whole pixels it learns of centring errors, and new
-noise makes it a faint star as often as one likes. Every star is a field point of its
-own, so the split `held_out` keeps whole stars from the training, all their images
-included; those stars are used as they are.
+A bright star is its own template. Moved by fractions of a pixel it is seen at every phase of the
+pixel grid, moved by whole pixels it has the centring errors of faint stars, and added noise makes
+any number of faint stars from it. Every star is a field point of its own, so the split `held_out`
+keeps all images of a star from the training; held-out stars are not interpolated.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from psfdae.stars.splits import draw_jitter, draw_phase
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:
-    """Return places of stars on a square lattice that keeps their order in the image.
+    """Return positions of stars on a square lattice that keeps their order in the image.
 
     Columns of equally many stars follow each other in x, the stars of a column in y.
     The pattern of `psfdae.stars.splits.held_out_fields` then takes every fifth star,
@@ -33,7 +32,7 @@ def star_grid(position: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     position : ndarray, shape (n, 2)
-        (x, y); the order of the stars counts where a position is not finite.
+        (x, y) in the image; if one is not finite, the order of the stars is used.
 
     Returns
     -------
@@ -50,59 +49,63 @@ def star_grid(position: np.ndarray) -> np.ndarray:
         members = by_x[start : start + rows]
         if is_located:
             members = members[np.argsort(position[members, 1], kind="stable")]
-        # Column of the lattice, and place in it.
+        # Column of the lattice, and position in it.
         grid[members] = np.stack([np.full(members.size, column), np.arange(members.size)], axis=1)
     return grid
 
 
-def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
-    """Return the star of every image, shape (images,): training stars, then those held out.
+def assign_stars(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
+    """Return the star of every image, shape (images,): training stars, then held-out stars.
 
-    So many images are wanted to train and to test, but at least one of each star; each
-    star of a part comes as often as the others, or once more.
+    `train` and `test` are the numbers of images of the two parts, but every star has at least one
+    image; the numbers of images of the stars of a part differ by one at most.
     """
     # Stars of each part in turn, until there are enough images.
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
     return np.concatenate([np.resize(stars, max(count, stars.size)) for stars, count in parts])
 
 
-def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
-    """Return the part of bins × bins of the field that each star is in, ix + bins·iy, (n,).
+def compute_bins(position: np.ndarray, bins: int) -> np.ndarray:
+    """Return the part of the field of each star, ix + bins·iy of bins × bins parts, (n,).
 
-    Where a position (n, 2) is not finite, all stars are in the first part.
+    If a position (n, 2) is not finite, all stars are in the first part.
     """
     if not np.isfinite(position).all():
         return np.zeros(len(position), dtype=np.int64)
-    # Place in the range of the positions, 0 … 1, along both axes.
+    # Position relative to the range of all positions, 0 … 1, along both axes.
     low, high = position.min(axis=0), position.max(axis=0)
     share = (position - low) / np.where(high > low, high - low, 1.0)
-    place = np.minimum((share * bins).astype(np.int64), bins - 1)
-    return np.asarray(place[:, 0] + bins * place[:, 1])
+    bin_index = np.minimum((share * bins).astype(np.int64), bins - 1)
+    return np.asarray(bin_index[:, 0] + bins * bin_index[:, 1])
 
 
-def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
+def stack_parts(images: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
     """Return the mean star of every part of the field, weighted by S/N, shape (parts, s, s).
 
-    The weight is S/N and not its square, so that one very bright star is not all of
-    its part. A part without stars gets the stack of all.
+    The weight is S/N and not its square, so that one very bright star does not dominate its part. A
+    part without stars gets the stack of all.
 
     Parameters
     ----------
-    aligned : ndarray, shape (n, s, s)
+    images : ndarray, shape (n, s, s)
+        Stars of flux 1, moved to a common centre.
     snr : ndarray, shape (n,)
+        S/N of the stars, their weight.
     part : ndarray of int, shape (n,)
+        Part of the field of each star, from 0.
     parts : int
+        Number of parts of the field.
     """
-    # The stack of all, in place of which come those of the parts that have stars.
-    everyone = np.average(aligned, axis=0, weights=snr)
-    stack = np.broadcast_to(everyone, (parts, *everyone.shape)).copy()
+    # The stack of all stars, replaced where a part has stars of its own.
+    mean_star = np.average(images, axis=0, weights=snr)
+    stack = np.broadcast_to(mean_star, (parts, *mean_star.shape)).copy()
     for index in np.unique(part):
         members = part == index
-        stack[index] = np.average(aligned[members], axis=0, weights=snr[members])
+        stack[index] = np.average(images[members], axis=0, weights=snr[members])
     return stack
 
 
-def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndarray:
+def compute_templates(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndarray:
     """Return the template of every star: the stack of training stars of its part of the field.
 
     Returns
@@ -110,16 +113,16 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     ndarray, shape (n, s, s)
         Centre at index (s//2, s//2), flux 1 inside the stamp.
     """
-    # Stars that are held out get the stack of the training stars around them.
-    part = bins_of(stars.position, bins)
+    # Held-out stars get the stack of the training stars in their part.
+    part = compute_bins(stars.position, bins)
     training = stars.select(~held_out)
-    return np.asarray(stacks(training.align(), training.snr, part[~held_out], bins**2)[part])
+    return np.asarray(stack_parts(training.align(), training.snr, part[~held_out], bins**2)[part])
 
 
-def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
+def stack_all(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
     """Return the stack of all training stars, (s, s), centre at index (s//2, s//2)."""
     # The field as a whole is the only part: all templates are the same.
-    return np.asarray(templates_of(stars, held_out, bins=1)[0])
+    return np.asarray(compute_templates(stars, held_out, bins=1)[0])
 
 
 def make_images(
@@ -131,46 +134,49 @@ def make_images(
     rng: np.random.Generator,
     centring_px: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frame stars as the network will see them, at new sub-pixel phases where asked for.
+    """Frame stars as the input of the network, some of them at new sub-pixel phases.
 
     Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
-    the sum 1. A template lies at its star's phase, in the same pixels. No pixel of a moved star is
+    the sum 1. A template has its star's phase, in the same pixels. No pixel of a moved star is
     below −`BrightStars.defect_sigma` σ of its sky, before the sum is made 1.
 
     Parameters
     ----------
     stars : BrightStars
+        Stars with wide stamps.
     template : ndarray, shape (n_stars, s, s)
-        Centre at index (s//2, s//2).
+        Template of every star, centre at index (s//2, s//2).
     star : ndarray of int, shape (n,)
         Star of every image.
     framing : Stamp
-        Its `stamp_px` and `jitter_px` count.
+        Settings, of which `stamp_px` and `jitter_px` are used.
     subpixel : ndarray of bool, shape (n,)
         Images of stars that are moved by up to ± ½ pixel; the others are not interpolated.
     rng : Generator
+        Generator of phases and jitter.
     centring_px : float
         FWHM of the Gaussian that smooths stars before their brightest pixel is searched.
 
     Returns
     -------
     realisation, template : ndarray, shape (n, d, d), float32
+        Images of the stars, and their templates, of sum 1.
     jitter : ndarray of int, shape (n, 2)
         Centring error (row, column) in pixels.
     phase : ndarray, shape (n, 2)
         Part of a pixel (row, column) by which the star was moved.
     """
-    # All draws first: the same images whatever their number at a time.
+    # All draws come first, so that images do not depend on the size of the chunks.
     side = framing.stamp_px
     phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
     jitter = draw_jitter(star.size, framing.jitter_px, rng)
     realisations, templates = np.empty((2, star.size, side, side), np.float32)
-    # A moved star may have its brightest pixel one px farther off.
+    # The brightest pixel of a moved star may be one px farther off.
     reach = int(np.abs(stars.peak).max()) + 1
     # 512 images at a time, which bounds the memory.
     for rows in (slice(start, start + 512) for start in range(0, star.size, 512)):
         star_rows, stamps = star[rows], stars.stamps[star[rows]]
-        # Move the star by its phase. Splines ring beside what is left of a saturated
+        # Move the star by its phase. Splines ring next to the remains of a saturated
         # neighbour.
         is_moved = subpixel[rows]
         floor = -BrightStars.defect_sigma * stars.noise[star_rows[is_moved], None, None]
@@ -179,8 +185,8 @@ def make_images(
         )
         # The brightest pixel goes to the middle, off by the jitter; the template likewise.
         offset = brightest_pixels(stamps, reach, centring_px)[0] - jitter[rows]
-        shifted = shift_stamps(template, stars.centre[star_rows] + phase[rows], star_rows)
-        for source, target in ((stamps, realisations), (shifted, templates)):
+        shifted_templates = shift_stamps(template, stars.centre[star_rows] + phase[rows], star_rows)
+        for source, target in ((stamps, realisations), (shifted_templates, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
     return realisations, templates, jitter, phase
@@ -198,12 +204,12 @@ def training_columns(
 ) -> dict[str, Column]:
     """Return columns of the product "stars": images of bright stars, and measurements of these.
 
-    `grid` (n, 2) is their place (`star_grid`); stars of each of `bins`² parts of the field
-    are stacked, and stars are framed as `make_images` does it.
+    `grid` (n, 2) is their position on the lattice of `star_grid`; stars of each of `bins`² parts of
+    the field are stacked, and stars are framed by `make_images`.
     """
     # Images of every star; those held out are not interpolated.
-    star = star_of_images(held_out, parts.train_stars, parts.test_stars)
-    template = templates_of(bright, held_out, bins)
+    star = assign_stars(held_out, parts.train_stars, parts.test_stars)
+    template = compute_templates(bright, held_out, bins)
     subpixel = ~held_out[star] & framing.subpixel
     images, templates, jitter, phase = make_images(
         bright, template, star, framing, subpixel, rng, centring_px

@@ -118,7 +118,7 @@ def photometry_of_image(
     # The model must know the PSF at every place (`field_range` refuses others), and have pixels
     # as large as those of the image.
     model.field_range()
-    observation = opened or open_observation(source, model.stamp_px).assuming()
+    observation = opened or open_observation(source, model.stamp_px).assume_scale()
     if observation.shape is None:
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
@@ -182,7 +182,7 @@ def measure_stars(
     """
     # A row without a position cannot be fitted, and one of a star that is listed twice has no
     # light of its own: measure the others, and add flagged rows for these.
-    unusable = observation.without_position() | observation.listed_again()
+    unusable = observation.lacks_position() | observation.find_repeated_stars()
     usable = observation.select(~unusable) if unusable.any() else observation
     measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR, turns)
     if unusable.any():

@@ -13,7 +13,7 @@ import numpy as np
 from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
-from psfdae.image.tables import table_of_rows
+from psfdae.image.tables import rows_to_table
 from psfdae.methods.metrics import cluster_mean
 from psfdae.training.calibration import COVERAGE
 from psfdae.training.star_sets import field_positions, own_noise, star_area
@@ -91,7 +91,7 @@ def measure_photometry(
                 fraction, star, usable
             )
         rows.append(row)
-    return table_of_rows(rows)
+    return rows_to_table(rows)
 
 
 def usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:

@@ -242,7 +242,7 @@ def _predict_all(
     columns: dict[str, list[np.ndarray]] = {}
     psfs, residuals, count = [], [], 0
     streams = (
-        model.stream(image.observation.with_margin(model.margin_px), threads=1)
+        model.stream(image.observation.replace_margin(model.margin_px), threads=1)
         for image in stars.images
     )
     for _, prediction in itertools.chain.from_iterable(streams):

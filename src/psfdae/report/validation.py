@@ -14,7 +14,7 @@ from psfdae.base.threads import fix_threads
 from psfdae.base.types import Table
 from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
-from psfdae.image.tables import table_of_rows, with_format
+from psfdae.image.tables import rows_to_table, set_format
 from psfdae.methods import method as method_of
 from psfdae.methods.interface import Method
 from psfdae.methods.metrics import all_metrics, quality, summarise_metrics
@@ -151,7 +151,7 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
         stars,
         methods,
         _error_table([*rows, *mean_rows], stars, methods),
-        table_of_rows(rows),
+        rows_to_table(rows),
         join_tables(per_star),
         measure_photometry(model, stars, restored),
         restored,
@@ -176,7 +176,7 @@ def join_tables(blocks: Sequence[Mapping[str, Any]]) -> Table:
         name: [np.broadcast_to(block.get(name, np.nan), block["star"].shape) for block in blocks]
         for name in names
     }
-    return with_format(Table({name: np.concatenate(values) for name, values in columns.items()}))
+    return set_format(Table({name: np.concatenate(values) for name, values in columns.items()}))
 
 
 def _error_table(
@@ -219,4 +219,4 @@ def _error_table(
                     "truth_mse": float(np.square(truth_sigma[split.test]).mean()),
                 }
             )
-    return table_of_rows(rows)
+    return rows_to_table(rows)

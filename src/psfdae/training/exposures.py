@@ -74,7 +74,7 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     # Its bright stars, chosen as those of the training, but few are enough.
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
-    observation = open_observation(source, info.stamp_px, calibration.margin_px).assuming()
+    observation = open_observation(source, info.stamp_px, calibration.margin_px).assume_scale()
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))

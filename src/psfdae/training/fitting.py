@@ -178,7 +178,7 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
         # later fits by less than a quarter of one: three fits are enough.
         wings = []
         for image in stars.images:
-            observation = with_measured_gain(model, image.observation.assuming())
+            observation = with_measured_gain(model, image.observation.assume_scale())
             photometry, _ = measure_stars(model, observation, image.source.given_threshold, 3)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:

@@ -44,7 +44,7 @@ def collect_stars(sources: Sequence[ImageInput], settings: Settings) -> ImageSta
     require_unique_names(sources)
     calibration = settings.calibration_stars
     observations: Sequence[Observation] = [
-        open_observation(source, settings.framing.stamp_px, calibration.margin_px).assuming()
+        open_observation(source, settings.framing.stamp_px, calibration.margin_px).assume_scale()
         for source in sources
     ]
     for observation in observations:

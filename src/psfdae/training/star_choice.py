@@ -177,13 +177,13 @@ def enlarge_stamps(
     if calibration.light_min:
         side = max(side, largest.side(calibration.light_min))
     is_larger = side > framing.stamp_px
-    if not (is_larger or largest.hollow):
+    if not (is_larger or largest.is_hollow):
         return None
     # Lengths of the choice of stars grow with their stamps, up to what the settings allow. Stars
     # without a sharp peak are centred on their light smoothed by their own width.
     scale, centring = side / framing.stamp_px, calibration.centring_px
     if centring is None:
-        centring = largest.fwhm_px if largest.hollow or largest.fwhm_px > 5.0 else 0.0
+        centring = largest.fwhm_px if largest.is_hollow or largest.fwhm_px > 5.0 else 0.0
     lengths = {
         "centring_px": float(f"{centring:.3g}"),
         "margin_px": min(round(calibration.margin_px * scale), 64),
@@ -216,7 +216,7 @@ def enlarge_stamps(
     )
     if largest.fwhm_px * min(scale_arcsec, 1.0) > 6.0:
         note += "; this is more than seeing makes: they are out of focus, or no stars"
-    if largest.hollow:
+    if largest.is_hollow:
         note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
     return settings.model_copy(update=groups), note
 

@@ -22,7 +22,7 @@ from psfdae.image.positions import list_offset
 from psfdae.image.selection import Candidates
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
-from psfdae.image.training_images import single_psf, star_grid, training_columns
+from psfdae.image.training_images import stack_all, star_grid, training_columns
 from psfdae.methods.interface import Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
@@ -178,7 +178,7 @@ class ImageStars:
     @property
     def mean_psf(self) -> np.ndarray:
         """Stack of all training stars, (s, s), its centre at index (s//2, s//2)."""
-        return single_psf(self.candidates.bright, self.held_out)
+        return stack_all(self.candidates.bright, self.held_out)
 
     def described(self) -> dict[str, Any]:
         """Return the description of the product "stars", as JSON holds it."""
@@ -270,7 +270,7 @@ def join_stars(exposures: Sequence[ImageStars]) -> ImageStars:
         shape=tuple(map(max, zip(*(image.shape or () for image in observations), strict=True))),
         header_cards=[card for image in observations for card in image.header_cards],
     )
-    candidates = Candidates.joined([image.candidates for image in exposures])
+    candidates = Candidates.concatenate([image.candidates for image in exposures])
     candidates.require(observation.path, first.settings.calibration_stars.stars_min)
     # The sky of a typical star: each image counts by its number of stars.
     sky_photons = np.repeat(

@@ -318,7 +318,7 @@ def fit_telescope(stars: ImageStars, telescope: Path) -> Row:
     # Thirty stars determine ten numbers, in some seconds.
     bright = stars.candidates.bright.row
     brightest = bright[np.argsort(-stars.candidates.snr[bright])[:30]]
-    observation = stars.observation.with_margin(0).select(brightest)
+    observation = stars.observation.replace_margin(0).select(brightest)
     # An image is usable without the state of the telescope.
     try:
         optics = read_telescope(telescope)
