@@ -10,7 +10,7 @@ import page_tables as tables
 
 from psfdae.image.camera import HEADER_KEYS
 from psfdae_paper.configuration.alignment import Alignment
-from psfdae_paper.configuration.compose import compose, dataset_names
+from psfdae_paper.configuration.compose import compose, list_datasets
 from psfdae_paper.evaluation.comparison import SIGNIFICANT
 
 STATES = tables.STATES
@@ -158,7 +158,7 @@ def input_page():
 
 def scenes():
     """The datasets and the three telescopes."""
-    for name in dataset_names():
+    for name in list_datasets():
         config = compose([f"dataset={name}"])
         if name not in {f"dataset{number}" for number in range(1, 9)}:
             continue

@@ -8,9 +8,9 @@ import pytest
 
 from command_line import psfdae
 from psfdae.base.files import ProductError, read_product
-from psfdae_paper.configuration.aligners import ESTIMATORS, list_estimators, trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.estimators import ESTIMATORS, list_estimators, list_trained_networks
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
 from psfdae_paper.tracking import read_alignment_runs
@@ -170,7 +170,7 @@ def test_twin_is_closer_in_focus(results):
 
 def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
     runs = {run.kind: run for run in read_alignment_runs(results)}
-    assert set(runs) == {"dae", *trained_networks()}
+    assert set(runs) == {"dae", *list_trained_networks()}
     for kind, run in runs.items():
         history = pd.read_csv(results / "alignment" / kind / "history.csv")
         curve = "train_mse" if kind == "dae" else "loss"

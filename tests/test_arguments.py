@@ -192,7 +192,7 @@ def test_the_line_names_the_argument_and_what_is_expected(image):
 def test_numbers_of_numpy_are_numbers(image):
     pixels, place = image
     numbers = {"gain": np.float32(1.5), "saturate": np.int64(60000), "accept_offset": np.True_}
-    observation = open_observation(ImageInput.of(pixels, {"catalogue": place, **numbers}), 16)
+    observation = open_observation(ImageInput.build(pixels, {"catalogue": place, **numbers}), 16)
     assert (observation.gain, observation.saturate) == (1.5, 60000)
 
 

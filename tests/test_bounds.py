@@ -11,18 +11,18 @@ from scipy.stats import poisson
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
-from psfdae_paper.bounds.estimates import stamp_model
-from psfdae_paper.bounds.floor import Comparison, local_error
+from psfdae_paper.bounds.estimates import build_stamp_model
+from psfdae_paper.bounds.floor import Comparison, compute_local_error
 from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
-    exact_posterior,
+    compute_exact_posterior,
+    compute_symmetry_weights,
+    cut_templates,
     extrapolate,
-    jittered_templates,
-    jitters,
+    list_jitters,
     merge,
-    posterior_sums,
-    symmetry_weights,
+    sum_posterior,
 )
 from psfdae_paper.stars.fields import perturb, relative_field
 from psfdae_paper.stars.framing import Propagation, brightest_pixel, normalise_flux
@@ -55,11 +55,11 @@ def bank():
 @pytest.fixture(scope="module")
 def members(bank):
     """Every image of the bank, one by one: image, field, jitter number, weight."""
-    weight = symmetry_weights(bank.field, bank.peak, POINTS)
+    weight = compute_symmetry_weights(bank.field, bank.peak, POINTS)
     rows = []
     for k in range(len(bank)):
         for s, symmetry in enumerate(SYMMETRIES):
-            for j, jitter in enumerate(jitters(1)):
+            for j, jitter in enumerate(list_jitters(1)):
                 row, column = symmetry.window(jitter, bank.margin)
                 cut = bank.framed[k, row : row + SIDE, column : column + SIDE].astype(float)
                 image = symmetry.image(cut / cut.sum())
@@ -88,7 +88,7 @@ def test_pixels_and_fields_move_with_the_image_of_eight_symmetries():
 
 def test_fields_stay_equally_likely():
     field, peak = np.arange(POINTS**2), np.tile([2, -4], (POINTS**2, 1))
-    weight = symmetry_weights(field, peak, POINTS)
+    weight = compute_symmetry_weights(field, peak, POINTS)
     assert (weight.sum(axis=1) == 8).all()
     assert sorted(weight[4])[-1] == 8  # the centre: one image stands for all eight
     assert sorted(weight[0]) == [0, 0, 0, 0, 2, 2, 2, 2]  # a corner is on one diagonal
@@ -113,7 +113,7 @@ def test_mirrored_crops_are_the_stars_of_mirrored_fields(scene1):
     originals = peaks[::8]  # the identity comes first
     framed = everything.stamps(20, np.repeat(originals, 8, axis=0))[::8]
     bank = Bank(framed, field, originals, seidel, 11, 1)
-    weight = symmetry_weights(field, originals, 11)
+    weight = compute_symmetry_weights(field, originals, 11)
     jitter = (1, 0)
     direct, _ = normalise_flux(everything.stamps(16, peaks - np.array([jitter])))
     for s, symmetry in enumerate(SYMMETRIES):
@@ -127,12 +127,12 @@ def test_mirrored_crops_are_the_stars_of_mirrored_fields(scene1):
 
 
 def test_templates_of_all_jitters_are_framed_and_normalised(bank):
-    stamps = jittered_templates(bank.framed[:5, 1:-1, 1:-1], jitter_px=1)
+    stamps = cut_templates(bank.framed[:5, 1:-1, 1:-1], jitter_px=1)
     assert stamps.shape == (5, 9, SIDE, SIDE)
     assert stamps.sum(axis=(2, 3)) == pytest.approx(np.ones((5, 9)), rel=1e-6)
     for shifted in stamps:
         brightest = [brightest_pixel(stamp, 1e-4) for stamp in shifted]
-        assert brightest == [(4 + row, 4 + column) for row, column in jitters(1)]
+        assert brightest == [(4 + row, 4 + column) for row, column in list_jitters(1)]
 
 
 def brute_force(members, noisy, flux, background):
@@ -149,9 +149,9 @@ def brute_force(members, noisy, flux, background):
 @pytest.mark.parametrize("level", [3e-5, 1e-3, 2e-2])
 def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members, stars, noise):
     noisy = noise.draw(stars, level, np.random.default_rng(2))
-    likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
+    likelihood = Likelihood.from_noise(noise, level, bank.stamps((2, 2)))
     halves = [replace(bank, chunk=7).take(np.arange(half, 40, 2)) for half in (0, 1)]
-    sums = merge([posterior_sums(half, noisy, likelihood) for half in halves])
+    sums = merge([sum_posterior(half, noisy, likelihood) for half in halves])
     w = brute_force(members, noisy, likelihood.flux, noise.background)
     images, field, jitter, _ = members
     flat = images.reshape(len(images), -1)
@@ -177,8 +177,8 @@ def test_given_the_field_only_its_images_count(level, corners, bank, members, no
     orbit_bank = replace(bank, chunk=7).take(np.flatnonzero(np.isin(bank.field, corners)))
     for corner in corners:
         noisy = noise.draw(images[field == corner][[3, 50]], level, np.random.default_rng(2))
-        likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
-        sums = posterior_sums(orbit_bank, noisy, likelihood, np.full(2, corner))
+        likelihood = Likelihood.from_noise(noise, level, bank.stamps((2, 2)))
+        sums = sum_posterior(orbit_bank, noisy, likelihood, np.full(2, corner))
         inside = (images, field, None, weight * (field == corner))
         w = brute_force(inside, noisy, likelihood.flux, noise.background)
         expected = np.einsum("nk,khw->nhw", w, images).reshape(2, -1)
@@ -201,8 +201,8 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
     truth = templates[field, [4, 0, 8, 3]]
     for level, certain in ((1e-3, True), (1e-2, False), (10.0, False)):
         noisy = noise.draw(truth, level, np.random.default_rng(4))
-        likelihood = Likelihood.of(noise, level, truth)
-        mean, variance, probability = exact_posterior(noisy, templates, likelihood)
+        likelihood = Likelihood.from_noise(noise, level, truth)
+        mean, variance, probability = compute_exact_posterior(noisy, templates, likelihood)
         flat = (images, None, None, np.ones(27))
         w = brute_force(flat, noisy, likelihood.flux, noise.background)
         assert probability == pytest.approx(w.reshape(4, 3, 9).sum(axis=2), abs=1e-8)
@@ -211,7 +211,7 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
         assert variance == pytest.approx((w * spread).sum(axis=1), abs=1e-12)
         assert (probability[np.arange(4), field] > 0.99).all() == certain
     assert probability == pytest.approx(np.full((4, 3), 1 / 3), abs=0.02)
-    mean, _, probability = exact_posterior(noisy, templates, likelihood, field)
+    mean, _, probability = compute_exact_posterior(noisy, templates, likelihood, field)
     assert probability == pytest.approx(np.eye(3)[field])
     inside = w * (np.repeat(np.arange(3), 9) == field[:, None])
     inside /= inside.sum(axis=1, keepdims=True)
@@ -230,7 +230,7 @@ def test_derivatives_are_those_of_the_propagated_stamp(scene1):
         opd = np.tensordot(monomial_coefficients(seidel, field), images, axes=1)
         return normalise_flux(propagate(opd[None], offset[None]))[0][0]
 
-    stamps, jacobians = stamp_model(scene1).derivatives(
+    stamps, jacobians = build_stamp_model(scene1).derivatives(
         monomial_coefficients(star, field)[None],
         monomial_coefficients(np.eye(5), field[None])[None],
         offset[None],
@@ -250,7 +250,7 @@ def test_floor_of_a_linear_gaussian_problem():
     jacobian = rng.standard_normal((1, 3, 16))
     sd = np.array([0.5, 2.0, 0.0])
     variance = rng.uniform(0.5, 2.0, (1, 16))
-    error = local_error(jacobian, sd, variance)[0]
+    error = compute_local_error(jacobian, sd, variance)[0]
     h, prior, noise_cov = jacobian[0].T, np.diag(sd**2), np.diag(variance[0])
     gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + noise_cov)
     uncertainty = prior - gain @ h @ prior
@@ -263,12 +263,12 @@ def test_floor_of_a_linear_gaussian_problem():
 def test_comparison_is_paired_and_tolerant():
     rng = np.random.default_rng(9)
     field, bound = np.arange(400) % 20, rng.exponential(1.0, 400)
-    equal = Comparison.paired(bound, bound, field)
+    equal = Comparison.from_pairs(bound, bound, field)
     assert (equal.efficiency, equal.difference, equal.beaten) == (1.0, 0.0, False)
-    shifted = Comparison.paired(bound + 0.1, bound, field)
+    shifted = Comparison.from_pairs(bound + 0.1, bound, field)
     assert shifted.difference == pytest.approx(0.1)
     assert shifted.stderr < 1e-12  # the stars' own scatter is common to both
     assert not shifted.beaten
-    assert not Comparison.paired(0.96 * bound, bound, field).beaten
-    assert Comparison.paired(0.8 * bound, bound, field).beaten
-    assert np.isnan(Comparison.paired(bound, 0 * bound, field).efficiency)
+    assert not Comparison.from_pairs(0.96 * bound, bound, field).beaten
+    assert Comparison.from_pairs(0.8 * bound, bound, field).beaten
+    assert np.isnan(Comparison.from_pairs(bound, 0 * bound, field).efficiency)

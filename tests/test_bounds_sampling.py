@@ -13,7 +13,7 @@ from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.mode_search import climb, find_twins, recentre
 from psfdae_paper.bounds.modes import Knowledge, Modes
-from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
+from psfdae_paper.bounds.posterior import Likelihood, list_jitters, merge
 from psfdae_paper.bounds.sampling import sample_posterior
 from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
@@ -38,7 +38,7 @@ def simulated(model, z, field):
     source = seidel_wavefronts(model.mean + model.sd * z, model.field[field])
     propagation = Propagation(source, model.telescope, model.optics, model.framing, 24)
     framed, peak = propagation.framed(model.framing.stamp_px + 2)
-    cuts = [crop_jittered(framed, np.array(jitter), 1) for jitter in jitters(1)]
+    cuts = [crop_jittered(framed, np.array(jitter), 1) for jitter in list_jitters(1)]
     return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1), peak
 
 
@@ -51,7 +51,7 @@ def stars(model, noise):
     jitter = np.array([0, 4, 5, 8])
     truth = images[np.arange(4), jitter]
     noisy = noise.draw(truth, LEVEL, np.random.default_rng(2))
-    return z, truth, noisy, peak - np.array(jitters(1))[jitter]
+    return z, truth, noisy, peak - np.array(list_jitters(1))[jitter]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def exact(model, stars, noise):
     z = np.tile(z, (len(FIELDS), 1))
     images, _ = simulated(model, z, field)
     images = images.reshape(len(z) * 9, -1)
-    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    likelihood = Likelihood.from_noise(noise, LEVEL, stars[1])
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(stars[2]) @ ratio.T + offset
     scores -= 0.5 * np.repeat((z**2).sum(axis=1), 9)
@@ -78,15 +78,15 @@ def exact(model, stars, noise):
 def modes(model, stars, noise):
     """Modes found from one start in the right field, at no aberration."""
     none = np.zeros(4, int)
-    start = Modes.at(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
-    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    start = Modes.make_starts(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
+    likelihood = Likelihood.from_noise(noise, LEVEL, stars[1])
     posteriors = StarPosteriors(stars[2], likelihood, model)
     first = climb(start, posteriors)
     return climb(first + find_twins(first, posteriors), posteriors)
 
 
 def sampled(model, modes, stars, noise, draws=2000, **blocks):
-    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    likelihood = Likelihood.from_noise(noise, LEVEL, stars[1])
     rngs = [stream(1, "test", star) for star in range(4)]
     posteriors = StarPosteriors(stars[2], likelihood, model)
     return sample_posterior(modes, posteriors, np.zeros(4, int), draws, rngs, **blocks)
@@ -134,8 +134,8 @@ def test_twins_give_the_same_image(model, noise):
     z_negated = z * [-1, 1, -1, -1, 1]  # the even part negated
     assert broad.stamps(z_negated, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
     none = np.zeros(1, int)
-    start = Modes.at(none, none, middle, none, z)
-    likelihood = Likelihood.of(noise, 1e-4, images[0])
+    start = Modes.make_starts(none, none, middle, none, z)
+    likelihood = Likelihood.from_noise(noise, 1e-4, images[0])
     twins = find_twins(start, StarPosteriors(images[0], likelihood, broad))
     at_twin = (twins.field == 1) & (twins.offset == middle).all(axis=1)
     assert twins.z[at_twin][0] == pytest.approx(z_far[0], abs=0.02)
@@ -150,8 +150,8 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
     z = np.array([[0.0, 0.3, 0.2, 0.3, 0.0], [0.5, 2.0, 1.0, 2.0, 0.5]])
     number, middle = np.arange(2), np.array([[1, 2], [0, 0]])
     images = broad.stamps(z, 2 * number, middle)
-    likelihood = Likelihood.of(noise, 1e-4, images)
-    start = Modes.at(number, 2 * number, middle, 0 * number, z)
+    likelihood = Likelihood.from_noise(noise, 1e-4, images)
+    start = Modes.make_starts(number, 2 * number, middle, 0 * number, z)
     posteriors = StarPosteriors(images, likelihood, broad)
     modes = climb(start, posteriors)
     for first in range(2):
@@ -170,7 +170,9 @@ def test_density_of_draws_is_students_t():
     rng = np.random.default_rng(5)
     factor = np.tril(rng.normal(0, 0.3, (2, 5, 5))) + np.eye(5)
     number, none = np.arange(2), np.zeros(2, int)
-    start = Modes.at(none, number, np.array([[0, 1], [2, 3]]), none, rng.normal(size=(2, 5)))
+    start = Modes.make_starts(
+        none, number, np.array([[0, 1], [2, 3]]), none, rng.normal(size=(2, 5))
+    )
     modes = replace(start, factor=factor)
     z, field = rng.normal(0, 3, (30, 5)), np.arange(30) % 2
     offset = np.where(np.arange(30) < 20, modes.offset[field].T, 7).T
@@ -187,21 +189,23 @@ def aside(stars, model, noise, level, shift):
     """A star in the noise of `level`, its mode `shift` pixels beside the right one."""
     z, truth, _, offset = (part[:1] for part in stars)
     noisy = noise.draw(truth, level, np.random.default_rng(7))
-    likelihood = Likelihood.of(noise, level, truth)
+    likelihood = Likelihood.from_noise(noise, level, truth)
     posteriors = StarPosteriors(noisy, likelihood, model)
     none = np.zeros(1, int)
-    start = Modes.at(none, none, offset + shift, np.full(1, Knowledge.FIELD), z)
-    truth = Modes.at(none, none, offset, np.full(1, Knowledge.TRUTH), z)
+    start = Modes.make_starts(none, none, offset + shift, np.full(1, Knowledge.FIELD), z)
+    truth = Modes.make_starts(none, none, offset, np.full(1, Knowledge.TRUTH), z)
     return climb(start, posteriors), truth, posteriors
 
 
 def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     z, truth, noisy, offset = stars
-    likelihood = Likelihood.of(noise, LEVEL, truth)
+    likelihood = Likelihood.from_noise(noise, LEVEL, truth)
     posteriors = StarPosteriors(noisy, likelihood, model)
     number, back = np.arange(len(z)), []
-    for shift in set(jitters(1)) - {(0, 0)}:
-        start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), Knowledge.FIELD), z)
+    for shift in set(list_jitters(1)) - {(0, 0)}:
+        start = Modes.make_starts(
+            number, 0 * number, offset + shift, np.full(len(z), Knowledge.FIELD), z
+        )
         modes = recentre(start, posteriors)
         back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.

@@ -11,7 +11,7 @@ from psfdae.base.files import ProductError, read_product
 from psfdae.methods import method
 from psfdae.methods.interface import Needs
 from psfdae.training.star_sets import noisy_test_images, split_stars
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import read_test_stars
 from psfdae_paper.bounds.tables import POSTERIOR_MEANS
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
@@ -143,7 +143,7 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
     for _, column in rows.groupby(["reference", "method", "noise_level"]):
         assert column.star.tolist() == test[:STARS].tolist()
         assert column.field.tolist() == product["field_index"][test[:STARS]].tolist()
-    noisy = bounded_stars(config, product).noisy
+    noisy = read_test_stars(config, product).noisy
     assert list(noisy) == list(LEVELS)
     for level in LEVELS:
         assert (noisy[level] == noisy_test_images(config, product, test, level)[:STARS]).all()

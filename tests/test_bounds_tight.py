@@ -65,13 +65,13 @@ def test_one_in_a_hundred_may_have_few_samples_or_none(thin, missing, low):
     ess = np.full(STARS, 300.0)
     ess[:thin] = 3.0
     mse[10 : 10 + missing] = np.nan
-    evidence = Evidence.of(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
+    evidence = Evidence.from_errors(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
     assert evidence.ess_low == low
     assert evidence.tight == (low >= 10)
 
 
 def measured(mse, ess=300.0):
-    """Rows of `star_measures` that are calibrated: errors, variances, effective sample sizes."""
+    """Calibrated rows of `measure_posteriors`: errors, variances, effective sample sizes."""
     return np.stack([mse, mse, mse, mse, np.full(STARS, ess)])
 
 
@@ -142,12 +142,12 @@ def test_no_efficiency_where_over_one_in_a_hundred_is_missing(tmp_path):
 def test_a_star_comes_from_the_bank_or_from_its_own_samples():
     """Wherever the bank has too few, and never fewer than it has."""
     bank = Estimates(*(measured(np.full(STARS, 1.0), ess=20.0) for _ in range(3)))
-    assert bank.improved(np.zeros(0, int), None) == (bank, 0)
+    assert bank.replace_sparse(np.zeros(0, int), None) == (bank, 0)
     sparse = np.array([3, 9, 11])
     rows = np.full((5, 3), 2.0)
     rows[-1] = [300.0, 5.0, 60.0]
     bank.full[-1, 11] = 55.0
-    improved, replaced = bank.improved(sparse, Estimates(rows, rows, rows))
+    improved, replaced = bank.replace_sparse(sparse, Estimates(rows, rows, rows))
     assert replaced == 1
     assert np.flatnonzero(improved.full[0] == 2.0).tolist() == [3]
     assert improved.full[-1, [3, 9, 11]].tolist() == [300.0, 20.0, 55.0]

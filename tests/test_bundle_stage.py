@@ -130,7 +130,7 @@ def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
         assert row["mse"] < row["mse_noisy"]
 
 
-def fresh_stars():
+def simulate_fresh_stars():
     """Stars that no method has seen, their noise σ, and the random stream that goes on."""
     rng = np.random.default_rng(5)
     return gaussians(1500, 99), np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), 1500)), rng
@@ -143,7 +143,7 @@ def covered(error, noise, nodes, maps):
 
 def test_half_width_covers_fresh_stars(tiny):
     config = load_stage(stage.bundle.stage.settings.reads, TINY)
-    images, noise, rng = fresh_stars()
+    images, noise, rng = simulate_fresh_stars()
     noisy = noise_model(config).draw(images, noise / 4.98, rng)
     error = estimator(tiny).predict(noisy) - images
     for part in np.array_split(np.argsort(noise), 3):
@@ -164,7 +164,7 @@ def mixture(folder):
 
 def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(mixture):
     """Its σ tells stars apart; the bundle's table corrects it. Threads change nothing."""
-    images, noise, rng = fresh_stars()
+    images, noise, rng = simulate_fresh_stars()
     noisy = images + rng.normal(size=images.shape) * noise[:, None, None]
     stated = {"flux": 1.0, "background": 0.0, "noise": noise}
     exact, threaded = (PsfModel(mixture).predict(noisy, **stated, threads=n) for n in (1, 2))
@@ -188,7 +188,7 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(mixture):
 
 
 def test_a_mixture_measures_flux_better_than_the_photometry_and_flags_blends(mixture, tiny):
-    images, noise, rng = fresh_stars()
+    images, noise, rng = simulate_fresh_stars()
     noise = np.minimum(noise, 0.01)
     noisy = images + rng.normal(size=images.shape) * noise[:, None, None]
     models = [PsfModel(bundle) for bundle in (mixture, tiny)]
@@ -233,7 +233,7 @@ def test_errors_of_some_stars_are_those_stars_errors():
     star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
     error = np.arange(10.0)[None, :, None, None] + np.zeros((2, 10, 4, 4))
     distance = 100.0 + np.arange(20.0).reshape(2, 10)
-    subset = StarErrors(np.array([1.0, 2.0]), error, star, distance).of(
+    subset = StarErrors(np.array([1.0, 2.0]), error, star, distance).select(
         np.array([False, True, False, False, True])
     )
     assert subset.star.tolist() == [1, 4, 1, 4]

@@ -16,7 +16,7 @@ from psfdae.methods import list_groups
 from psfdae.methods.networks.training import fingerprint
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
-from psfdae_paper.configuration.consistency import SIMULATION, simulation_changes
+from psfdae_paper.configuration.consistency import SIMULATION, compare_simulations
 from psfdae_paper.workflow.datasets import stars_choice
 from workflow_runs import captured
 
@@ -43,7 +43,7 @@ def settings_of(dataset):
 )
 def test_a_dataset_with_another_simulation_than_its_stars_is_named(override, key):
     """Datasets share the stars of a file: a change in a dataset alone would have no effect."""
-    changes = simulation_changes(
+    changes = compare_simulations(
         compose.compose(("dataset=dataset3", override)), compose.compose(("dataset=dataset1",))
     )
     assert key in [name for name, *_ in changes]
@@ -54,7 +54,7 @@ def test_a_dataset_with_another_simulation_than_its_stars_is_named(override, key
 def test_datasets_have_the_simulation_of_their_stars(dataset):
     tree = compose.compose((f"dataset={dataset}",))
     first = compose.compose((stars_choice(tree["stars"]["name"]),))
-    assert not simulation_changes(tree, first)
+    assert not compare_simulations(tree, first)
 
 
 @pytest.mark.parametrize("dataset", DATASETS)
@@ -174,8 +174,8 @@ def test_search_distances_follow_from_the_telescope():
 
 
 def test_settings_that_cannot_change_a_result_are_set_apart():
-    tree = compose.stage_tree(list_groups("dae"), compose.compose())
-    indecisive = {*as_overrides(tree)} - {*as_overrides(compose.decisive_settings(tree))}
+    tree = compose.select_stage_groups(list_groups("dae"), compose.compose())
+    indecisive = {*as_overrides(tree)} - {*as_overrides(compose.drop_neutral_settings(tree))}
     assert [text.split(".", 1)[1] for text in indecisive] == ["checkpoint_seconds=20.0"]
 
     def checkpoint(*overrides):
@@ -205,11 +205,11 @@ def test_overrides_reach_the_datasets_that_know_them():
         ("dataset3", "wavefront.coma=3"),
         ("dataset8", "++wavefront.r0_m=0.1"),
     ):
-        dataset_overrides = compose.overrides_for(overrides, [f"dataset={dataset}"])
+        dataset_overrides = compose.select_overrides(overrides, [f"dataset={dataset}"])
         assert dataset_overrides == (scene_override, *common)
     # Another telescope decides which keys there are.
     overrides = ["telescope=example_zernike", "telescope.aberrations.jitter_waves=0.1"]
-    assert compose.overrides_for(overrides, ["dataset=dataset8"]) == tuple(overrides)
+    assert compose.select_overrides(overrides, ["dataset=dataset8"]) == tuple(overrides)
 
 
 def test_stage_overrides_reproduce_the_stage_s_configuration():
@@ -220,7 +220,7 @@ def test_stage_overrides_reproduce_the_stage_s_configuration():
         ((), ("dataset=dataset5", "preset=smoke")),
         (own_telescope, own_telescope),
     ):
-        tree = compose.stage_tree(SIMULATION, compose.compose(overrides))
+        tree = compose.select_stage_groups(SIMULATION, compose.compose(overrides))
         pinned = [*names, *as_overrides(tree)]
         assert load_stage(SIMULATION, pinned) == load_stage(SIMULATION, overrides)
 

@@ -26,8 +26,8 @@ from psfdae.image.opening import open_observation
 from psfdae.image.stamps import cut_image
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
-from psfdae.photometry.photon_noise import measure_gain, with_measured_gain
-from psfdae.photometry.wings_fit import StarFluxes, draw_tents, wings_of
+from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
+from psfdae.photometry.wings_fit import StarFluxes, draw_tents, fit_wings
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.wings import Wings, compute_prior_profile
 from psfdae.training.neighbours import draw_other_stars
@@ -198,20 +198,20 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
     noise = np.full(image.shape, 5.0), nothing
-    wings = wings_of(image, *noise, stars, 10)
+    wings = fit_wings(image, *noise, stars, 10)
     light, error = wings.light()
     if brightness == 1.0:
         assert light == pytest.approx(true.light()[0], abs=4 * error)
         assert error < 0.05 * light
         # Of a sky with structure pixels share what is left; the error knows it.
         wavy = image + 10.0 * np.sin(np.arange(300) / 15)[:, None]
-        off, doubt = wings_of(wavy, *noise, stars, 10).light()
+        off, doubt = fit_wings(wavy, *noise, stars, 10).light()
         assert doubt > 4 * error and abs(off - true.light()[0]) < 2 * doubt
     else:
         # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
         assert light == pytest.approx(0.65 * 0.03, abs=0.002)
         assert 0.3 * light < error < 1.5 * light
-    assert wings_of(image, *noise, stars._replace(flux=np.full(30, np.nan)), 10) is None
+    assert fit_wings(image, *noise, stars._replace(flux=np.full(30, np.nan)), 10) is None
 
 
 def test_the_light_of_wings_is_the_sum_over_pixels():
@@ -247,7 +247,7 @@ def test_expected_wings_fall_as_the_fifth_power():
 def test_the_part_of_the_flux_in_the_model_has_the_error_of_the_wings():
     wings = Wings(RADIUS, np.full(len(RADIUS), 1e-3), 1e-12 * np.eye(len(RADIUS)), 0.03)
     light, sigma = wings.light()
-    part, error = CrowdedPhotometry(*[None] * 4, wings, None).part_of_model()
+    part, error = CrowdedPhotometry(*[None] * 4, wings, None).compute_model_share()
     assert part == pytest.approx(1.0 / (1.0 + light)) and light > 0.2
     half_width = 0.5 * (1.0 / (1.0 + light - sigma) - 1.0 / (1.0 + light + sigma))
     assert error == pytest.approx(half_width, rel=1e-3)
@@ -261,8 +261,8 @@ def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
         open_observation(ImageInput(folder / "i.fits", detect=5.0), STAMP),
     )
     unknown = replace(observation, camera=observation.camera | {"gain": CameraValue(None, "")})
-    assert with_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
-    assert with_measured_gain(model, observation) is observation
+    assert add_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
+    assert add_measured_gain(model, observation) is observation
     place = np.stack([true["x"], true["y"]], axis=1)
     light = np.zeros((SIZE, SIZE))
     add_stamps(light, np.array(true["flux"])[:, None, None] * stamps(*place.T), *place.T)
@@ -304,7 +304,10 @@ def test_models_of_photutils_do_not_mix(sky):
 def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
     """Light at the nodes, between and beyond them; none of a star that no stamp holds."""
     model = load_model(sky[1])
-    grid, photutils = PsfGrid.of(model, 4, oversampling), model.to_photutils(4, oversampling)
+    grid, photutils = (
+        PsfGrid.sample(model, 4, oversampling),
+        model.to_photutils(4, oversampling),
+    )
     low, high = photutils.grid_xypos.min(axis=0), photutils.grid_xypos.max(axis=0)
     rng = np.random.default_rng(4)
     place = np.vstack([rng.uniform(low, high, (20, 2)), low, low - 9.3, high + 7.6])
@@ -318,7 +321,7 @@ def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
 
 
 def test_derivatives_of_a_grid_are_those_of_its_light(sky):
-    grid, step = PsfGrid.of(load_model(sky[1]), 4, 4), 1e-3
+    grid, step = PsfGrid.sample(load_model(sky[1]), 4, 4), 1e-3
     place = np.array([[grid.columns.mean() + 0.3, grid.rows.mean() - 0.4]])
     corner = np.rint(place).astype(int) - 4
     slopes = grid.stamps(place, corner, 9)[0, 1:]

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae.denoise.bundle import read_bundle
-from psfdae.image.camera import camera_values, sky_sample
+from psfdae.image.camera import camera_values, sample_sky
 from psfdae.image.detection import Sky
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
@@ -72,7 +72,7 @@ def test_stars_are_found_where_they_are(field):
     assert stars.detections.numbers("BACKGROUND") == pytest.approx(300 / 1.6, rel=0.08)
     # What a list is judged by.
     column, row = np.rint(example.centroid.T).astype(int)
-    assert stars.sky().covered(column, row, 2.0).mean() > 0.9
+    assert stars.sky().is_on_source(column, row, 2.0).mean() > 0.9
 
 
 def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
@@ -100,13 +100,13 @@ def test_pixels_off_an_image_are_on_no_source():
     nothing = np.zeros(star.shape, bool)
     sky = Sky(star, 0.0 * star, np.ones(star.shape), nothing, np.nan)
     column, row = np.array([79, 80, 79, -1, 79, 5]), np.array([59, 59, 60, 59, -1, 5])
-    assert sky.covered(column, row, 2.0).tolist() == [True, *[False] * 5]
+    assert sky.is_on_source(column, row, 2.0).tolist() == [True, *[False] * 5]
 
 
 def test_the_sky_is_sampled_evenly_over_the_rows(tmp_path):
     """The median of a sky that rises by 1 count a row is the middle row's."""
     rise = np.indices((640, 64))[0] + np.random.default_rng(2).normal(0.0, 2.0, (640, 64))
-    sample = sky_sample(find_image(write(tmp_path / "rise.fits", rise)))
+    sample = sample_sky(find_image(write(tmp_path / "rise.fits", rise)))
     assert sample.level == pytest.approx(319.5, abs=5.0)
     assert sample.highest == pytest.approx(rise.max())
 

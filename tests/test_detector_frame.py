@@ -226,7 +226,7 @@ def test_adaptation_names_the_part_of_the_field_without_stars(image, model, axis
 def test_field_angles_of_a_subframe_do_not_count_from_its_middle_without_a_word(tmp_path, image):
     for cards, count in (({"LTV1": -FIRST[0], "LTV2": -FIRST[1]}, 1), ({}, 0)):
         path, place, _ = subframe(tmp_path, image, **cards)
-        notes = note_axis(open_observation(ImageInput.of(path, {"catalogue": place}), 16))
+        notes = note_axis(open_observation(ImageInput.build(path, {"catalogue": place}), 16))
         assert len(notes) == count and all("x 150, y 170 of the detector" in n for n in notes)
 
 

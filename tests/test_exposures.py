@@ -270,13 +270,13 @@ def test_wings_of_several_images_are_one_profile():
     """Each counts by its error; a profile is by the light in the outer part of the PSF."""
     radius, eye = np.array([5.0, 8.0, 12.0]), np.eye(3)
     wings = Wings(radius, np.array([1e-5, 1e-4, 3e-5]), 1e-12 * eye, 0.02)
-    assert Wings.joined([wings]).plain() == wings.plain()
-    pair = Wings.joined([wings, wings])
+    assert Wings.join([wings]).plain() == wings.plain()
+    pair = Wings.join([wings, wings])
     assert pair.profile == pytest.approx(wings.profile)
     assert pair.light()[1] == pytest.approx(wings.light()[1] / np.sqrt(2))
     vague = Wings(radius, 3 * wings.profile, 1e-8 * eye, 0.02)
-    assert Wings.joined([wings, vague]).profile == pytest.approx(wings.profile, rel=1e-3)
+    assert Wings.join([wings, vague]).profile == pytest.approx(wings.profile, rel=1e-3)
     doubled = Wings(radius, 2 * wings.profile, 4e-12 * eye, 0.04)
     light = np.array([0.03])
-    joined = Wings.joined([wings, doubled]).total_over_flux(light)[0]
+    joined = Wings.join([wings, doubled]).total_over_flux(light)[0]
     assert joined == pytest.approx(wings.total_over_flux(light)[0])

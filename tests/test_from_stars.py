@@ -22,7 +22,7 @@ from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.base.files import read_product, write_product
 from psfdae.base.rng import stream
 from psfdae.commands import train as stage
-from psfdae.commands.train import locked_folder
+from psfdae.commands.train import lock_folder
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
@@ -292,8 +292,8 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
         "import sys, time; from pathlib import Path\n"
-        "from psfdae.commands.train import locked_folder\n"
-        "with locked_folder(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+        "from psfdae.commands.train import lock_folder\n"
+        "with lock_folder(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
     words = [sys.executable, "-c", holder, str(out)]
@@ -302,7 +302,7 @@ def test_one_process_at_a_time_works_in_a_folder(training, tmp_path):
         message = refused("train", *training.words, "--out", out, *WORDS)
         process.kill()
     assert str(out) in message
-    with locked_folder(out):
+    with lock_folder(out):
         assert list(out.iterdir()) == []
     assert not out.exists()
 

@@ -16,7 +16,7 @@ from psfdae.methods.interface import Needs, TrainingSet
 from psfdae.methods.mixture import fit as mixture_fit
 from psfdae.methods.mixture.clusters import remove_slope
 from psfdae.stars.noise import NoiseModel
-from psfdae.training.packing import packed
+from psfdae.training.packing import pack
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
@@ -332,14 +332,14 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
     np.testing.assert_allclose(main.evidence, full.evidence, atol=0.5)
     assert len(mixture.export(D, 0.1)[0]["deviation"]) < 0.6 * len(arrays["deviation"])
     size = sum(array.nbytes for array in arrays.values())
-    unlimited = packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]
+    unlimited = pack(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]
     assert unlimited["rows"].tolist() == arrays["rows"].tolist()
-    smaller = packed(mixture, D, NOISE.kappa * LEVEL, 0.8 * size)[0]
+    smaller = pack(mixture, D, NOISE.kappa * LEVEL, 0.8 * size)[0]
     assert 0.6 * size < sum(array.nbytes for array in smaller.values()) <= 0.8 * size
     errors = [np.square(e.psf - truth).mean() for e in (restored(smaller), full)]
     assert errors[0] < 1.1 * errors[1]
     with pytest.raises(BundleError, match=r"takes more than 0.001 MB"):
-        packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
+        pack(mixture, D, NOISE.kappa * LEVEL, 1e3)
 
 
 @pytest.mark.parametrize(

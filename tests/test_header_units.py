@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from astropy.io.fits import Header
 
-from psfdae.image.camera import camera_values, electrons_per_count, unread_card_remarks
+from psfdae.image.camera import camera_values, find_gain, unread_card_remarks
 from psfdae.image.fits_file import ImageFile, PlainFile
 
 
@@ -27,7 +27,7 @@ def image_with(**cards):
 )
 def test_the_gain_belongs_to_the_unit_of_the_pixels(unit, gain):
     """Pixels in electrons have gain 1, rates and calibrated pixels none, counts the header's."""
-    value, origin = electrons_per_count(image_with(BUNIT=unit, GAIN=4.0))
+    value, origin = find_gain(image_with(BUNIT=unit, GAIN=4.0))
     assert value == gain
     assert origin == {1.0: "BUNIT", 4.0: "GAIN"}.get(gain, origin)
     assert gain is not None or "not known" in origin

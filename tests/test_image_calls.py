@@ -84,7 +84,7 @@ def test_commands_of_detected_stars_residual_and_report_are_the_calls(image, sta
     # A page of a command has the names of options, one of Python those of keywords.
     assert page.read_text("utf-8").replace("--stamp-px 8", "stamp_px=8") == report.page()
     assert lines[-1] == str(report)
-    words = ("--model", bundle, "--out", page)
+    words = ("--model", bundle, "--out", page, "--overwrite")
     assert "stars.csv: no such file" in refused(
         "validate", image, "--catalogue", "stars.csv", *words
     )
@@ -98,7 +98,7 @@ def test_detected_stars_are_a_star_list(image, model):
     assert len(detected) == small_field.COUNT and detected["flux_iso"].unit == "adu"
     prediction = model.predict_image(image, catalogue=detected)
     assert len(prediction) == len(detected)
-    with pytest.raises(library.Error, match="gian: no statement on an image; did you mean gain"):
+    with pytest.raises(library.Error, match="gian: not an option of an image; did you mean gain"):
         library.detect(image, gian=1.5)
 
 

@@ -12,9 +12,10 @@ from psfdae.image.image_input import ImageInput
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.prior import FieldSettings
 from psfdae.photometry import crowded
-from psfdae.photometry.image_photometry import photometry_of_image
+from psfdae.photometry.image_photometry import measure_all_stars
 from psfdae.psf.exchange import write_psfex
 from psfdae.psf.grid import PsfGrid
+from psfdae.psf.photutils_grid import make_photutils_grid
 from psfdae.psf.wings import Wings
 from psfdae.training import neighbours
 from simulated_fields import CAMERA, compare, simulate_field
@@ -78,11 +79,11 @@ def test_psfs_have_the_same_light_at_every_phase(bright_field, tmp_path):
     assert_allclose(field.draw_on_pixels(place).sum(axis=(1, 2)), expected, atol=tolerance)
     # What photometry, photutils and PSFEx's readers interpolate, to a row at the edge of the PSF.
     tolerance += 16 * profile(8.0)
-    grid = PsfGrid.of(field, 2)
+    grid = PsfGrid.sample(field, 2)
     corner = np.floor(place + 0.5).astype(int) - 8
     assert_allclose(grid.stamps(place, corner, 16)[:, 0].sum(axis=(1, 2)), expected, atol=tolerance)
     y, x = np.mgrid[142:158, 142:158]
-    photutils = field.to_photutils(2)
+    photutils = make_photutils_grid(field, 2, 4)
     sums = [photutils.evaluate(x, y, 1.0, *at).sum() for at in place]
     assert_allclose(sums, expected, atol=tolerance)
     write_psfex(tmp_path / "f.psf", field, 4)
@@ -156,14 +157,14 @@ def measured_twice(request):
     image, place, flux = plate(request.param)
     camera = {"pixel_scale_arcsec": 1.7}
     model = psfdae.fit(psfdae.Stars.from_image(image, place, **camera), method="field")
-    photometry = photometry_of_image(model, ImageInput.of(image, camera | {"catalogue": place}))
+    photometry = measure_all_stars(model, ImageInput.build(image, camera | {"catalogue": place}))
     return request.param, model, model.predict_image(image, place, **camera), photometry, flux
 
 
 def test_light_outside_of_stamps_is_one_number(measured_twice):
     _, model, prediction, photometry, flux = measured_twice
     light, error = model.wings.light()
-    image_light, image_error = photometry.measured.wings.light()
+    image_light, image_error = photometry.star_fit.wings.light()
     assert light > 5 * error
     assert image_light == pytest.approx(light, abs=max(error, image_error))
     assert not any("in the training" in note for note in photometry.notes)
@@ -182,7 +183,7 @@ def test_photometry_has_the_psf_of_each_magnitude(measured_twice):
     is_plate = saturation < 1e5
     assert (model.magnitude_range is not None) == is_plate
     # At a node of the grid, so that nothing but the magnitude is interpolated.
-    grid = PsfGrid.of(model, 2, by_magnitude=True)
+    grid = PsfGrid.sample(model, 2, by_magnitude=True)
     place = np.tile(np.rint(model.grid(2, 2)[0]), (4, 1))
     counts = 10 ** np.array([3.0, 4.5, 5.0, 7.0])
     stamps = grid.stamps(place, place.astype(int) - 8, 16, counts)[:, 0]

@@ -78,7 +78,7 @@ rule count_fields:
         f"{RESULTS}/fields.txt",
     params:
         config=lambda w: settings(RUN, "count-fields", "dataset=dataset3"),
-        source=code_of("count-fields"),
+        source=hash_code("count-fields"),
     shell:
         "psfdae count-fields --config {params.config} --out {output}"
 """

@@ -339,7 +339,7 @@ def test_a_night_killed_between_any_two_files_is_the_same_once_repeated(tmp_path
     monkeypatch.setattr(night_stage, "fit_image", lambda stars, start: model)
     monkeypatch.setattr(validation, "validate", lambda model, stars: page)
     photometry = SimpleNamespace(table=table)
-    monkeypatch.setattr(image_photometry, "photometry_of_image", lambda *a, **kw: photometry)
+    monkeypatch.setattr(image_photometry, "measure_all_stars", lambda *a, **kw: photometry)
 
     def run(out):
         night_images(tmp_path / "rows.csv", out / "images", out / "part.csv")

@@ -12,10 +12,10 @@ import psfdae
 from command_line import refused
 from psfdae.api import Stars
 from psfdae.image import bad_pixels
-from psfdae.image.detection import sky_of
+from psfdae.image.detection import find_sky
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
-from psfdae.image.interpolation import interpolated, interpolated_stamps
+from psfdae.image.interpolation import fill_bad, fill_bad_stamps
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict, fill_bad_pixels
 from psfdae.image.sky_level import (
@@ -66,29 +66,29 @@ def with_cosmics(image, seed=3, count=40):
 # Cosmic rays and hot pixels.
 
 
-def cosmic_rays(image, saturate=6e4):
+def find_cosmic_rays(image, saturate=6e4):
     none = np.zeros(image.shape, bool)
-    return bad_pixels.cosmic_rays(image, none, bad_pixels.pixel_noise(image, none), saturate)
+    return bad_pixels.find_cosmic_rays(image, none, bad_pixels.pixel_noise(image, none), saturate)
 
 
 @pytest.mark.parametrize("fwhm", [1.2, 1.6, 2.8, 8.0])
 def test_cosmic_rays_are_found_and_stars_are_none(fwhm):
     image = field(fwhm)[0]
-    assert not cosmic_rays(image).any()
+    assert not find_cosmic_rays(image).any()
     dirty, true = with_cosmics(image)
-    flagged = cosmic_rays(dirty)
+    flagged = find_cosmic_rays(dirty)
     assert (flagged & ~true).sum() <= 2
     assert (flagged & true).sum() >= 0.9 * true.sum()
 
 
 def test_no_star_as_narrow_as_a_pixel_is_a_cosmic_ray():
-    assert not cosmic_rays(with_cosmics(field(0.5)[0])[0]).any()
+    assert not find_cosmic_rays(with_cosmics(field(0.5)[0])[0]).any()
 
 
 def test_a_saturated_star_has_no_cosmic_rays(clean):
     flat = np.minimum(clean[0], 3000.0)
-    assert not cosmic_rays(flat, 3000.0).any()
-    assert not bad_pixels.blank_areas(flat, np.zeros(flat.shape, bool), 3000.0)
+    assert not find_cosmic_rays(flat, 3000.0).any()
+    assert not bad_pixels.find_blank_areas(flat, np.zeros(flat.shape, bool), 3000.0)
 
 
 def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
@@ -98,7 +98,7 @@ def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
     stars = Stars.from_image(dirty, detect=True, **CAMERA)
     distance, _ = cKDTree(place).query(stars.candidates.bright.position)
     assert (distance < 1).all() and len(stars) >= 0.9 * len(clean_set)
-    count = np.count_nonzero(cosmic_rays(dirty))
+    count = np.count_nonzero(find_cosmic_rays(dirty))
     assert abs(count - true.sum()) < 0.1 * true.sum()
     assert f"left out: {count} pixels of cosmic rays and hot pixels" in "\n".join(stars.notes)
     assert "left out" not in "\n".join(clean_set.notes)
@@ -197,7 +197,7 @@ def test_outside_of_an_image_circle_nothing_is_exposed(clean, kind, sky):
     assert (part[~found.mask] > dimmest).mean() > share
     assert found.mask[is_bright].mean() < 0.2
     # Level and noise of the sky are right up to the edge.
-    measured = sky_of(image, found.mask)
+    measured = find_sky(image, found.mask)
     at = is_bright & ~found.mask
     sigma = np.sqrt(1.5 * sky + 25) / 1.5
     assert np.abs(measured.level - bias - sky)[at].mean() < 0.25 * sigma
@@ -232,8 +232,8 @@ def test_a_known_structure_of_the_sky_is_used_again():
     wave = 100.0 * np.sin(2 * np.pi * row / 64)
     wave[(np.maximum(np.abs(row - 256), np.abs(column - 256)) > 64)] = 0.0
     image = SKY + wave + np.random.default_rng(2).normal(0, 15, wave.shape)
-    none, middle = np.zeros(wave.shape, bool), np.s_[220:290, 220:290]
-    unknown, known = (sky_of(image, none, structure=s) for s in (None, SkyStructure(is_fine=True)))
+    bad, middle = np.zeros(wave.shape, bool), np.s_[220:290, 220:290]
+    unknown, known = (find_sky(image, bad, structure=s) for s in (None, SkyStructure(is_fine=True)))
     assert not unknown.structure.is_fine and known.structure.is_fine
     assert (
         np.std((unknown.level - wave)[middle]) > 50.0 > 20.0 > np.std((known.level - wave)[middle])
@@ -281,10 +281,10 @@ def test_bad_pixels_of_a_stamp_are_filled_from_the_same_stamp():
     stamps, bad = rng.normal(size=(4, 9, 9)), rng.random((4, 9, 9)) < 0.1
     stamps += 1e3 * np.arange(4)[:, None, None]
     bad[1], bad[2, 0], bad[3, -1] = False, True, True
-    filled = interpolated_stamps(stamps, bad)
+    filled = fill_bad_stamps(stamps, bad)
     assert (filled[~bad] == stamps[~bad]).all()
     for stamp, is_bad, expected in zip(stamps, bad, filled, strict=True):
-        assert interpolated(stamp, is_bad)[0] == pytest.approx(expected)
+        assert fill_bad(stamp, is_bad)[0] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("rows", "is_found"), [(7, False), (8, True), (30, True)])
@@ -292,7 +292,7 @@ def test_squares_of_one_value_have_8_px(rows, is_found):
     values = np.random.default_rng(3).normal(size=(50, 60))
     flat = np.zeros(values.shape, bool)
     flat[20 : 20 + rows, 12:20] = True
-    is_constant = bad_pixels.constant_squares(np.where(flat, 5.0, values))
+    is_constant = bad_pixels.find_constant_squares(np.where(flat, 5.0, values))
     assert (is_constant == (flat & is_found)).all()
 
 
@@ -312,7 +312,7 @@ def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
     image, place, _ = clean
     row, column = np.indices(image.shape) - SIDE / 2
     halo = 3000.0 / (1 + np.hypot(row, column) ** 2 / 400)
-    sky = sky_of(image + halo, np.zeros(image.shape, bool))
+    sky = find_sky(image + halo, np.zeros(image.shape, bool))
     assert "structure within 64 px" in sky.notes[0]
     stars = sky.stars(5.0)
     sources = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
@@ -482,7 +482,7 @@ def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):
     bad = np.zeros(image.shape, bool)
     column, row = np.rint(place).astype(int).T
     bad[row, column] = True
-    sources = sky_of(np.where(bad, np.nan, image), bad).stars(5.0)
+    sources = find_sky(np.where(bad, np.nan, image), bad).stars(5.0)
     centres = np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1) - 1
     distance, index = cKDTree(centres).query(place)
     assert len(centres) == len(place) == len(set(index)) and distance.max() < 0.5
@@ -511,12 +511,12 @@ def test_noise_of_few_counts_has_no_blank_areas():
     rng = np.random.default_rng(5)
     for scatter in (0.2, 0.4, 1.0):
         image = np.rint(rng.normal(100.0, scatter, (256, 256)))
-        assert not bad_pixels.blank_areas(image, np.zeros(image.shape, bool))
+        assert not bad_pixels.find_blank_areas(image, np.zeros(image.shape, bool))
     # Nor has the even sky of an image without noise, where the light of stars ends.
     image = np.full((256, 256), 7.0)
     image[100:132, 100:132] += drawn(moffat(3.0), [(16, 16)], [1e4], 32)
     none = np.zeros(image.shape, bool)
-    assert not bad_pixels.blank_areas(image, none)
+    assert not bad_pixels.find_blank_areas(image, none)
     bad_pixels.refuse_clipped_sky(image, none)
 
 
@@ -524,13 +524,13 @@ def test_overscan_of_the_header_is_bad_where_the_pixels_confirm_it(clean):
     image = clean[0]
     header = fits.Header({"TRIMSEC": "[1:300,1:320]", "BIASSEC": "[305:320,1:320]"}.items())
     none = np.zeros(image.shape, bool)
-    assert not bad_pixels.overscan([header], image, none)  # it was trimmed, and this is sky
+    assert not bad_pixels.find_overscan([header], image, none)  # it was trimmed, and this is sky
     rng, frame = np.random.default_rng(6), image.copy()
     frame[:, 300:] = rng.normal(50.0, 4.0, (SIDE, 20))
-    ((key, area),) = bad_pixels.overscan([header], frame, none)
+    ((key, area),) = bad_pixels.find_overscan([header], frame, none)
     assert key == "TRIMSEC" and area[:, 300:].all() and not area[:, :300].any()
     untrimmed = fits.Header({"TRIMSEC": "[51:2098,1:2048]"}.items())
-    assert not bad_pixels.overscan([untrimmed], frame, none)
+    assert not bad_pixels.find_overscan([untrimmed], frame, none)
 
 
 # Clipped skies.

@@ -170,7 +170,7 @@ def test_images_of_a_night_are_parts_of_ten_whose_rows_name_the_job(tmp_path, mo
         (tmp_path / f"image{i:02}.fits").touch()
     words = {"images": "*.fits", "results": "out"}
     dry = read_run(words, is_dry=lambda: True)
-    assert [len(part) for part in night.night_parts(dry)] == [10, 2]
+    assert [len(part) for part in night.split_night(dry)] == [10, 2]
     path = night.rows_file(dry, "1")
     assert not (tmp_path / "out").exists()
     assert night.rows_file(read_run(words), "1") == path
@@ -206,5 +206,5 @@ def test_our_rules_are_found_by_their_names():
     written = set(re.findall(r"^rule (\w+):|^use rule \w+ as (\w+) with:", text, re.M))
     names = {name for pair in written for name in pair if name}
     assert len(re.findall(r"^ +rule:", text, re.M)) == 2
-    assert not fits.rules_without(names)
-    assert not datasets.datasets_without(names)
+    assert not fits.list_new_rules(names)
+    assert not datasets.list_datasets_except(names)

@@ -63,13 +63,13 @@ def test_stars_are_where_the_header_says_whatever_the_order_of_the_axes(
     # The sky by astropy alone, axis by axis.
     if projection == "TPV" and latitude_first:
         # wcslib 8 mirrors this one: it is not used, and the image says so.
-        observation = open_observation(ImageInput.of(path, {"catalogue": place}), 16)
+        observation = open_observation(ImageInput.build(path, {"catalogue": place}), 16)
         assert observation.wcs is None and "damaged and not used" in observation.summary()
         return
     world = WCS(header).all_pix2world(place, 0).T[:: -1 if latitude_first else 1]
     sky = SkyCoord(*world, unit="deg", frame=FRAMES[longitude]).icrs
     catalogue = Table({"ra": sky.ra.deg, "dec": sky.dec.deg})
-    observation = open_observation(ImageInput.of(path, {"catalogue": catalogue}), 16)
+    observation = open_observation(ImageInput.build(path, {"catalogue": catalogue}), 16)
     np.testing.assert_allclose(observation.positions, place, atol=1e-3)
     assert observation.pixel_scale_arcsec == pytest.approx(0.6, rel=0.01)
     # Stars of S/N 50 have centroids within some tenths of a pixel.
@@ -91,7 +91,7 @@ def test_a_third_axis_does_not_move_the_sky(tmp_path, axes, planes):
     header = sky_header(axes=axes, latitude_first=True) + small_field.header()
     header["WCSAXES"] = 3
     fits.writeto(path, pixels if planes is None else pixels[None], header)
-    observation = open_observation(ImageInput.of(path, {"catalogue": place}), 16)
+    observation = open_observation(ImageInput.build(path, {"catalogue": place}), 16)
     if axes == (1, 2):
         dec, ra = WCS(sky_header(latitude_first=True)).all_pix2world(place, 0).T
         sky = SkyCoord(ra, dec, unit="deg", frame=FRAMES["RA"]).icrs

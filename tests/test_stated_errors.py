@@ -16,7 +16,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.errors import excess_scatter
 from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
 from psfdae.training.calibration import fit_model_errors
-from psfdae.training.fitting import described, fit_method
+from psfdae.training.fitting import describe_settings, fit_method
 from psfdae.training.packing import add_wings, build_uncalibrated
 from small_field import GAIN, READ, SKY, noisy
 
@@ -58,7 +58,7 @@ def fitted(seed):
     camera = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
     stars = psfdae.Stars.from_image(image, place, **camera)
     field = fit_method(stars, FieldMixture)
-    settings, of_fit = stars.settings, described(stars, FieldMixture)
+    settings, of_fit = stars.settings, describe_settings(stars, FieldMixture)
     packed, _ = build_uncalibrated(
         field, stars.product, "realisation", settings, of_fit, "field", ""
     )

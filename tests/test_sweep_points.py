@@ -17,7 +17,7 @@ from psfdae.methods import list_groups
 from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
-from psfdae_paper.configuration.sweep import point_groups
+from psfdae_paper.configuration.sweep import list_point_groups
 from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
@@ -62,7 +62,7 @@ class Point:
         )
 
     def run(self, *overrides, model="dae", values=None, keys=None, trial=None):
-        config = load_stage(point_groups(model), (*TINY, *overrides))
+        config = load_stage(list_point_groups(model), (*TINY, *overrides))
         stage.point(config, model, values or {}, keys or {}, self.task, trial)
         return self.result()
 
@@ -159,7 +159,7 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    settings = load_stage(point_groups("noise_trained"), (*Alignment.choice, *overrides))
+    settings = load_stage(list_point_groups("noise_trained"), (*Alignment.choice, *overrides))
     stage.point(settings, "noise_trained", {}, {}, task)
     metrics = read_json(folder / "result.json")["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):

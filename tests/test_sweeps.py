@@ -9,7 +9,7 @@ import yaml
 
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
+from psfdae_paper.configuration.sweep import Axis, list_sweeps, load_sweep
 from psfdae_paper.sweeps import adaptive
 from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep
 
@@ -39,7 +39,7 @@ def sweep(config_folder):
     return plan
 
 
-@pytest.mark.parametrize("name", sweep_names())
+@pytest.mark.parametrize("name", list_sweeps())
 def test_every_shipped_sweep_can_be_planned(name):
     plans = [plan_sweep(name, (f"preset={preset}",)) for preset in ("fast", "paper")]
     assert all(5 <= len(plan.points) <= 24 for plan in plans)

@@ -12,9 +12,9 @@ from psfdae.methods.interface import TrainingSet
 from psfdae.methods.metrics import mse
 from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae.training.star_sets import noise_model
-from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
-from psfdae_paper.bounds.floor import local_error
-from psfdae_paper.bounds.modes import largest_of_groups
+from psfdae_paper.bounds.estimates import build_stamp_model, simulate_fresh_stars
+from psfdae_paper.bounds.floor import compute_local_error
+from psfdae_paper.bounds.modes import select_largest
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.methods.wavefront import Wavefront
@@ -29,7 +29,9 @@ TEST = 24
 def stars():
     """Simulated stars, the last ones for tests: configuration, columns, images."""
     config = load(["dataset=dataset3", "preset=smoke"])
-    columns = {name: c.values for name, c in fresh_stars(config, "trial", 120 + TEST).items()}
+    columns = {
+        name: c.values for name, c in simulate_fresh_stars(config, "trial", 120 + TEST).items()
+    }
     margin = (columns["framed"].shape[-1] - config.framing.stamp_px) // 2
     cuts = crop_jittered(columns["framed"].astype(float), np.array([0, 0]), margin)
     return config, columns, normalise_flux(cuts)[0].astype(np.float32)
@@ -63,14 +65,14 @@ def noisy(stars):
 @pytest.mark.parametrize("name", NAMES)
 def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
     config, columns, images = stars
-    model, field = stamp_model(config), columns["field_index"][-TEST:]
+    model, field = build_stamp_model(config), columns["field_index"][-TEST:]
     _, slopes = model.derivatives(
-        model.coefficients(model.standardised(columns["seidel"][-TEST:]), field),
+        model.coefficients(model.standardise(columns["seidel"][-TEST:]), field),
         monomial_coefficients(np.eye(5), model.field[field][:, None]),
         columns["peak"][-TEST:],
     )
     variance = noise_model(config).variance(images[-TEST:].reshape(TEST, -1), LEVEL)
-    floor = local_error(slopes, model.sd, variance)
+    floor = compute_local_error(slopes, model.sd, variance)
     psf = fitted[name].estimate(noisy, LEVEL, data.positions[-TEST:]).psf
     error = mse(psf, images[-TEST:])
     assert 0.4 < error.mean() / floor.mean() < 1.4
@@ -119,11 +121,11 @@ def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, nam
     _, columns, _ = stars
     modes, missed = fitted[name].modes(noisy, LEVEL, data.positions[-TEST:])
     assert missed.size == 0
-    truth = fitted[name].model.standardised(columns["seidel"][-TEST:])
+    truth = fitted[name].model.standardise(columns["seidel"][-TEST:])
     modes_of_field = modes.take(
         np.flatnonzero(modes.field == columns["field_index"][-TEST:][modes.star])
     )
-    first = modes_of_field.take(largest_of_groups(modes_of_field.star, modes_of_field.evidence, 1))
+    first = modes_of_field.take(select_largest(modes_of_field.star, modes_of_field.evidence, 1))
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0

@@ -139,7 +139,7 @@ def inputs(tmp_path_factory):
         printed("train", folder / "i.fits", *words, *settings, "--out", folder / "model")
         simulated = ["telescope=example_zernike", "--image-snr", 80, "grid.points=3"]
         printed("simulate", *simulated, "--out", folder / "sky")
-        once(patch, photometry, "photometry_of_image")
+        once(patch, photometry, "measure_all_stars")
         once(patch, predict, "open_for_model")
         once(patch, wavefront, "measure_wavefronts")
         once(patch, train, "fit_method", "pack_model", "adapt_to_exposures", "validate")

@@ -17,8 +17,8 @@ from psfdae.base.files import read_product, write_text
 from psfdae.denoise.bundle import read_bundle
 from psfdae.methods import method
 from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars
-from psfdae_paper.configuration.aligners import list_estimators
 from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.estimators import list_estimators
 from psfdae_paper.evaluation.comparison import read_seed_scatter
 from workflow_runs import captured, command, copy_of_sources, environment, planned, snakemake
 

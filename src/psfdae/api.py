@@ -19,7 +19,7 @@ from psfdae.denoise.star_model import StarModel
 from psfdae.image.containers import as_images
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput, ImageKeywords, ImageOptions
-from psfdae.photometry.image_photometry import photometry_of_image
+from psfdae.photometry.image_photometry import measure_all_stars
 from psfdae.psf.interface import NodeCount, Oversampling
 from psfdae.psf.photutils_grid import make_photutils_grid
 from psfdae.training.exposures import exposure
@@ -97,8 +97,8 @@ class Stars(ImageStars):
         Parameters
         ----------
         image : path-like, array of shape (h, w) or (n, s, s), NDData, HDU, or several of these
-            FITS image, or cube of stamps; or images that are exposures of one camera, of which all
-            that follows is stated alike. Mask, uncertainty, unit, WCS and meta of CCDData and
+            FITS image, or cube of stamps; or images that are exposures of one camera, with the
+            same options for all. Mask, uncertainty, unit, WCS and meta of CCDData and
             NDData are used, and the mask of a masked array; an HDUList is read as a file is.
         catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
             Star list: a file, a table with its columns, or positions (x, y), 0-based; of several
@@ -122,7 +122,7 @@ class Stars(ImageStars):
         settings = {name: value for name, value in options.items() if name not in names}
         source = ImageInput(images[0], catalogue=catalogue, **image_options)
         all_settings = apply_keywords(settings_model()(), Settings.image_groups, settings)
-        stars = collect_stars(source.of_each(images), all_settings)
+        stars = collect_stars(source.repeat_for(images), all_settings)
         return cls(*(getattr(stars, field.name) for field in fields(stars)))
 
 
@@ -163,10 +163,9 @@ class PsfModel(StarModel):
             Its centres are exact, for models that measure centres (field).
         threads : int, optional
             By default, all cores.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`. Also `flux_column` and
-            `background_column` of the list.
+        **options
+            Options of the image (`psfdae.image.image_input.ImageOptions`), such as `detect=True` in
+            place of a list. Also `flux_column` and `background_column` of the list.
 
         Returns
         -------
@@ -176,9 +175,9 @@ class PsfModel(StarModel):
         Raises
         ------
         Error
-            If the image or its list cannot be used, or its pixels are not those of the model.
+            If the image or its list cannot be used, or its pixel scale is not the model's.
         """
-        source = ImageInput.of(image, {**options, "catalogue": catalogue})
+        source = ImageInput.build(image, {**options, "catalogue": catalogue})
         return predict_stars(self, source, threads, fixed)
 
     @check_arguments
@@ -192,21 +191,26 @@ class PsfModel(StarModel):
     ) -> Self:
         """Return this model adapted to another exposure, as `psfdae adapt` does.
 
-        The stars of the exposure show how its PSF differs from that of the model; ten may be
-        enough.
+        The stars of the exposure show how its PSF differs from the model's; ten may be enough.
 
         Parameters
         ----------
-        image, catalogue, **options : as those of `predict_image`
+        image : path-like, array, NDData, HDU or HDUList
+            FITS image of the other exposure.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list, as `Stars.from_image` takes it.
+        **options
+            Options of the image (`psfdae.image.image_input.ImageOptions`), such as `gain=1.5` or
+            `detect=True`.
         name : str, optional
-            Name of the new model, by default that of the image.
+            Name of the new model, by default the image's.
 
         Raises
         ------
         Error
-            If this is no model of a field, or the image has too few bright stars.
+            If this is not a model of a field, or the image has too few bright stars.
         """
-        source = ImageInput.of(image, {**options, "catalogue": catalogue})
+        source = ImageInput.build(image, {**options, "catalogue": catalogue})
         return exposure(self, source, name or source.name)[0]
 
     @check_arguments
@@ -227,18 +231,18 @@ class PsfModel(StarModel):
         Parameters
         ----------
         image : path-like, array, NDData, HDU or HDUList
-            The image that the model learnt from, or another one with the same PSF.
+            The image that the model was trained on, or another one with the same PSF.
         catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
-            Star list; no other stars are looked for.
+            Star list; no other stars are searched for.
         zero_point : float, optional
             Magnitude of a flux of 1.
         reference : as `catalogue`, optional
             Star list with magnitudes, which give the zero point.
         magnitude_column : str
             Column of the reference with the magnitudes.
-        **statements
-            Statements on the image, such as `detect=True` in place of a list; they are named and
-            explained in `psfdae.image.image_input.ImageStatements`.
+        **options
+            Options of the image (`psfdae.image.image_input.ImageOptions`), such as `detect=True` in
+            place of a list.
 
         Returns
         -------
@@ -248,10 +252,10 @@ class PsfModel(StarModel):
         Raises
         ------
         Error
-            If the image or a list cannot be used, or the model knows no PSF of a place.
+            If the image or a list cannot be used, or the model does not know the PSF at a position.
         """
-        source = ImageInput.of(image, {**options, "catalogue": catalogue})
-        return photometry_of_image(self, source, zero_point, reference, magnitude_column).table
+        source = ImageInput.build(image, {**options, "catalogue": catalogue})
+        return measure_all_stars(self, source, zero_point, reference, magnitude_column).table
 
     @check_arguments
     def residual(
@@ -259,15 +263,21 @@ class PsfModel(StarModel):
     ) -> CCDData:
         """Return an image without its sky and stars, which are measured as by `photometry`.
 
-        `psfdae.photometry.image_photometry.photometry_of_image` gives table and residual of one
+        `psfdae.photometry.image_photometry.measure_all_stars` gives table and residual of one
         measurement.
 
         Parameters
         ----------
-        image, catalogue, **options : as those of `photometry`
+        image : path-like, array, NDData, HDU or HDUList
+            FITS image with the PSF of the model.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
+            Star list; no other stars are searched for.
+        **options
+            Options of the image (`psfdae.image.image_input.ImageOptions`), such as `gain=1.5` or
+            `detect=True`.
         """
-        source = ImageInput.of(image, {**options, "catalogue": catalogue})
-        return photometry_of_image(self, source).residual
+        source = ImageInput.build(image, {**options, "catalogue": catalogue})
+        return measure_all_stars(self, source).residual
 
     @check_arguments
     def to_photutils(self, nodes: NodeCount = 9, oversampling: Oversampling = 4) -> GriddedPSFModel:
@@ -292,7 +302,7 @@ class PsfModel(StarModel):
 
 @check_arguments
 def load_model(path: str | Path | None = None) -> PsfModel:
-    """A trained model, ready to predict the PSFs of stars.
+    """Return a trained model, ready to predict the PSFs of stars.
 
     Parameters
     ----------
@@ -302,7 +312,7 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     Raises
     ------
     BundleError
-        If the file is missing, damaged, of a newer format, or no model bundle.
+        If the file is missing, damaged, of a newer format, or not a model bundle.
     PredictionError
         If it describes a telescope.
     MissingExtraError
@@ -330,6 +340,7 @@ def fit(
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of one or several images (`Stars.from_image`).
     method : str, optional
         "gmm", "field" or "dae"; by default, of the methods in the settings, the one with the
         smallest error on validation stars, or "field" where stars are few.

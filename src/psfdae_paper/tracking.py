@@ -27,15 +27,15 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.methods.interface import CONFIG, HISTORY, Method
-from psfdae_paper.configuration.aligners import (
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.compose import list_datasets, load
+from psfdae_paper.configuration.estimators import (
     ESTIMATORS,
     Estimator,
-    swept_networks,
-    trained_networks,
+    list_swept_networks,
+    list_trained_networks,
 )
-from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.compose import dataset_names, load
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation.night import read_night
 from psfdae_paper.sweeps.points import compute_hash
 
@@ -206,7 +206,7 @@ def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[Track
             # Every method in the table of errors that leaves files is a run.
             split, reference = path.stem.split("-", 1)
             method_names = {*read_table(path, "method").method}
-            for kind in registered():
+            for kind in list_methods():
                 if kind.storage and kind.name in method_names:
                     runs.append(
                         _read_fit_run(results, kind, (dataset, split, reference), stars, path)
@@ -310,7 +310,7 @@ def read_alignment_runs(results: Path) -> list[TrackedRun]:
     figures = sorted((results / "figures/alignment").glob("*.png"))
     scene_files = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
     runs = []
-    for kind in ("dae", *trained_networks()):
+    for kind in ("dae", *list_trained_networks()):
         weights = DAE_WEIGHTS if kind == "dae" else Estimator.weights_file
         folder = results / "alignment" / kind
         # As for datasets, the number of the start that succeeded is not a setting.
@@ -441,7 +441,7 @@ def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:
     model, config = result["model"], result["config"]
     # Files of the model, and the product with its training data if the workflow made it.
     data = None
-    if model in swept_networks():
+    if model in list_swept_networks():
         model_files = _network_files(folder, Estimator.weights_file)
         data = results / f"data/alignment/{ESTIMATORS[model].states}.h5"
     else:
@@ -483,7 +483,7 @@ def select_settings(run: TrackedRun, preset: str) -> dict[str, str]:
     dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
     defaults = {}
     # Stars other than the datasets, such as a user's own, lack defaults.
-    if run.dataset in dataset_names() and (config_dir() / f"preset/{preset}.yaml").is_file():
+    if run.dataset in list_datasets() and (config_dir() / f"preset/{preset}.yaml").is_file():
         # Settings of the dataset as the preset alone has them.
         defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
     differing = {

@@ -26,7 +26,7 @@ from psfdae.methods import method
 from psfdae.methods.metrics import cluster_mean, mse
 from psfdae.training.star_sets import field_positions, read_stars, training_set
 from psfdae_paper.bounds import mode_search
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import read_test_stars
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.methods.wavefront import Wavefront
 from psfdae_paper.stages.evaluate import estimators
@@ -50,7 +50,7 @@ def main(results: Path, out: Path, picture: Path) -> None:
     config = load([f"dataset={DATASET}"])
     name = config.stars.name
     product = read_stars(results / "data" / config.scene.name / f"{name}.h5", REFERENCE)
-    stars = bounded_stars(config, product)
+    stars = read_test_stars(config, product)
     position = field_positions(product)[stars.star]
     noisy, truth = stars.noisy[LEVEL], stars.truth[REFERENCE]
     rows = []

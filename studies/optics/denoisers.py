@@ -23,7 +23,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.methods.metrics import cluster_mean, mse
 from psfdae.training.star_sets import read_stars, training_set
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import read_test_stars
 from psfdae_paper.configuration.compose import load
 
 sys.path.append(str(Path(__file__).parents[2] / "workflow/benchmarks"))
@@ -36,7 +36,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
     config = load([f"dataset={dataset}"])
     place = results / "data" / config.scene.name / f"{config.stars.name}.h5"
     product = read_stars(place, "template")
-    stars = bounded_stars(config, product)
+    stars = read_test_stars(config, product)
     rows = []
 
     def add(name, level, reference, error, seconds):

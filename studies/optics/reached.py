@@ -22,7 +22,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods import method
 from psfdae.methods.metrics import cluster_mean
 from psfdae.training.star_sets import field_positions, training_set
-from psfdae_paper.bounds.estimates import bounded_stars, true_modes
+from psfdae_paper.bounds.estimates import get_true_modes, read_test_stars
 from psfdae_paper.bounds.mode_search import climb
 from psfdae_paper.bounds.stamp_model import StarPosteriors
 from psfdae_paper.configuration.compose import load
@@ -83,9 +83,9 @@ def misses(config, product, bank, optics) -> dict:
     kind = method(optics)
     data = training_set(config, kind, product, "random", "realisation")
     fitted = kind.from_bank(bank, config, data)
-    stars = bounded_stars(config, product)
+    stars = read_test_stars(config, product)
     position, count = field_positions(product)[stars.star], len(stars.star)
-    truth = true_modes(fitted.model, product, stars)
+    truth = get_true_modes(fitted.model, product, stars)
     by_level = {}
     for level, noisy in stars.noisy.items():
         modes, doubtful = fitted.modes(noisy, level, position)

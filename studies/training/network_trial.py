@@ -20,9 +20,9 @@ import pandas as pd
 
 from psfdae.base.files import read_product
 from psfdae.commands.cli import main as psfdae
-from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.source import git_commit
 from psfdae_paper.stages.alignment_methods import denoise, draw_test_stamps, load_predictor
 
@@ -31,7 +31,7 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
     """Train, measure, append."""
     root = Path(results)
     states, dae = root / "data/alignment", root / "alignment/dae"
-    dae_option = [f"--dae={dae}"] * ESTIMATORS[kind].denoised
+    dae_option = [f"--dae={dae}"] * ESTIMATORS[kind].uses_dae
     config = load([*Alignment.choice, *overrides])
     test = read_product(states / "uniform.h5", "alignment_states", ("states", "stamps"))
     with tempfile.TemporaryDirectory() as folder:
@@ -43,7 +43,7 @@ def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None
         predict, rows = load_predictor(Path(folder), test, config), []
         for level in config.noise.levels:
             noisy = draw_test_stamps(config, test["stamps"], "uniform", level)
-            inputs = denoise(dae, config, noisy) if ESTIMATORS[kind].denoised else noisy
+            inputs = denoise(dae, config, noisy) if ESTIMATORS[kind].uses_dae else noisy
             error = np.abs(predict(inputs) - test["states"]).mean()
             row = dict(network=kind, trial=trial, settings=" ".join(overrides))
             row |= dict(noise_level=level, mean_abs_error=error, cpu_s=seconds)

@@ -10,7 +10,8 @@ import numpy as np
 from psfdae.base.rng import stream
 from psfdae.denoise.flux_model import FluxModel
 from psfdae.denoise.star_flux import Photometer
-from psfdae.methods.networks.dae import TrainingSet, image_scale
+from psfdae.methods.networks.dae import TrainingSet
+from psfdae.methods.networks.settings import image_scale
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import draw_jitter
 from psfdae.training.packing import leading
@@ -62,7 +63,7 @@ class Bench:
         """Flux model of each scene, of stars that are not among the tested ones."""
         # Scene 2 has no random aberrations: there it is the same PSFs, other stars.
         half = self.turbulence.images[: len(self.turbulence.images) // 2]
-        fresh = fresh_stars(self.seidel.config, MODEL_STARS)
+        fresh = simulate_fresh_stars(self.seidel.config, MODEL_STARS)
         return {"seidel": FluxModel.fit(fresh), "turbulence": FluxModel.fit(half)}
 
     def test_stars(self, scene="seidel"):
@@ -87,7 +88,7 @@ class Bench:
         return TrainingSet(images, images, *parts, levels, self.noise)
 
 
-def fresh_stars(config, count):
+def simulate_fresh_stars(config, count):
     """Noise-free normalised stars of scene 1 from random streams of their own."""
     config = changed(config, stars={"name": "stability"})
     fields, jitter = (stream(config.seed, name, "stability") for name in ("field", "jitter"))

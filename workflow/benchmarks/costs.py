@@ -106,7 +106,7 @@ def time_method(name, tree, stars, bound):
     from psfdae.base.threads import limit_threads
     from psfdae.methods.metrics import mse
     from psfdae.training import star_sets
-    from psfdae_paper.bounds.estimates import SPLIT, bounded_stars
+    from psfdae_paper.bounds.estimates import SPLIT, read_test_stars
 
     # Imports are no part of the fit.
     for module in ("torch", "minisom", "sklearn.cluster", "skimage.restoration"):
@@ -114,7 +114,7 @@ def time_method(name, tree, stars, bound):
     limit_threads(1)
     config, kind = part(groups(name), tree), method_class(name)
     product = star_sets.read_stars(stars, "template")
-    tested = bounded_stars(config, product)
+    tested = read_test_stars(config, product)
     position = star_sets.field_positions(product)[tested.star]
     # The fit to the training stars of the random split, its choices by validation stars included.
     with TemporaryDirectory() as folder:

@@ -264,7 +264,7 @@ def covered(bundle, product, seed):
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     is_odd = np.unique(star, return_inverse=True)[1] % 2 == 1
     halves = [
-        star_sets.HeldOutStars.of(product, reference, noise, test[half])
+        star_sets.HeldOutStars.select(product, reference, noise, test[half])
         for half in (is_odd, ~is_odd)
     ]
     cells = {}

@@ -21,7 +21,7 @@ from psfdae.methods import method
 from psfdae.methods.fit_files import get_rule_name
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
-from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.methods import list_method_groups
 from psfdae_paper.configuration.schema import Config
 
 BATCHES = (1, 16, 64, 256, 1024)
@@ -56,7 +56,8 @@ def random_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
-    from psfdae.methods.networks.dae import build_dae, image_scale
+    from psfdae.methods.networks.dae import build_dae
+    from psfdae.methods.networks.settings import image_scale
 
     widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
@@ -208,7 +209,7 @@ def extrapolated(rows, names, stars):
     return costs
 
 
-READS = ("parts", *all_groups(), "evaluation", "methods", "benchmark")
+READS = ("parts", *list_method_groups(), "evaluation", "methods", "benchmark")
 
 
 @command("stages", reads=(*SIMULATION, "noise", *READS))

@@ -1,8 +1,8 @@
 # Scene 3: states of misalignment, their stamps, the networks, estimates, fits and bounds.
 wildcard_constraints:
     states="grid|uniform|train",
-    test_set=any_of(alignment.TEST_SETS),
-    network=any_of(trained_networks()),
+    test_set=match_any(alignment.TEST_SETS),
+    network=match_any(list_trained_networks()),
     level=r"[0-9.e-]+",
 
 
@@ -17,7 +17,7 @@ rule alignment_model:
     priority: 120
     params:
         config=lambda w: settings(RUN, "alignment model"),
-        source=code_of("alignment model"),
+        source=hash_code("alignment model"),
     message:
         "Fitting the wavefront of scene 3 to ray-traced states"
     shell:
@@ -35,14 +35,14 @@ rule alignment_states:
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{states}}.tsv"
     priority: 120
-    threads: lambda w: alignment.alignment_config(RUN).optics.threads
+    threads: lambda w: alignment.load_alignment_config(RUN).optics.threads
     resources:
         mem_mb=1000,
     params:
         kind=lambda w: w.states,
         config=lambda w: settings(RUN, "alignment states"),
         inputs=as_options,
-        source=code_of("alignment states"),
+        source=hash_code("alignment states"),
     message:
         "Simulating the stamps of scene 3, set {wildcards.states}"
     shell:
@@ -64,7 +64,7 @@ rule alignment_telescope:
     params:
         config=lambda w: settings(RUN, "alignment telescope"),
         inputs=as_options,
-        source=code_of("alignment telescope"),
+        source=hash_code("alignment telescope"),
     message:
         "Tabulating key figures of scene 3"
     shell:
@@ -83,14 +83,14 @@ rule alignment_dae:
     benchmark:
         f"{RESULTS}/benchmarks/alignment/dae.tsv"
     priority: 120
-    threads: lambda w: alignment.alignment_config(RUN).dae_train.threads
+    threads: lambda w: alignment.load_alignment_config(RUN).dae_train.threads
     resources:
         mem_mb=1500,
         runtime=60,
     params:
         config=lambda w: settings(RUN, "alignment train-dae"),
         inputs=as_options,
-        source=code_of("alignment train-dae"),
+        source=hash_code("alignment train-dae"),
         folder=subpath(output.weights, parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
         checkpoint=f"{RESULTS}/checkpoints/alignment-dae.pt",
@@ -112,14 +112,14 @@ rule alignment_network:
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{network}}.tsv"
     priority: 120
-    threads: lambda w: getattr(alignment.alignment_config(RUN), f"train_{w.network}").threads
+    threads: lambda w: getattr(alignment.load_alignment_config(RUN), f"train_{w.network}").threads
     resources:
         mem_mb=1600,
         runtime=60,
     params:
         config=lambda w: settings(RUN, "alignment train-network", kind=w.network),
         inputs=as_options,
-        source=code_of("alignment train-network"),
+        source=hash_code("alignment train-network"),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.network}.pt",
     message:
@@ -146,7 +146,7 @@ rule alignment_bound:
     params:
         config=lambda w: settings(RUN, "alignment bound"),
         inputs=as_options,
-        source=code_of("alignment bound"),
+        source=hash_code("alignment bound"),
     message:
         "Bounding the errors of misalignments, set {wildcards.test_set}"
     shell:
@@ -158,7 +158,7 @@ rule alignment_estimate:
     input:
         **{
             network: f"{RESULTS}/alignment/{network}/network.safetensors"
-            for network in trained_networks()
+            for network in list_trained_networks()
         },
         states=f"{RESULTS}/data/alignment/{{test_set}}.h5",
         dae=rules.alignment_dae.output.weights,
@@ -169,14 +169,14 @@ rule alignment_estimate:
         f"{RESULTS}/logs/alignment/estimate_{{test_set}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/estimate_{{test_set}}.tsv"
-    threads: lambda w: alignment.alignment_config(RUN).evaluation.threads
+    threads: lambda w: alignment.load_alignment_config(RUN).evaluation.threads
     resources:
         mem_mb=1500,
         runtime=20,
     params:
         config=lambda w: settings(RUN, "alignment estimate"),
         inputs=as_options,
-        source=code_of("alignment estimate"),
+        source=hash_code("alignment estimate"),
     message:
         "Estimating misalignments with the networks, set {wildcards.test_set}"
     shell:
@@ -203,7 +203,7 @@ rule alignment_fit:
     params:
         config=lambda w: settings(RUN, "alignment fit"),
         inputs=as_options,
-        source=code_of("alignment fit"),
+        source=hash_code("alignment fit"),
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"
     shell:

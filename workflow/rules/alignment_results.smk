@@ -18,7 +18,7 @@ rule alignment_tables:
         f"{RESULTS}/benchmarks/alignment/tables.tsv"
     params:
         inputs=as_options,
-        source=code_of("alignment tables"),
+        source=hash_code("alignment tables"),
     message:
         "Tabulating errors of misalignments"
     shell:
@@ -50,9 +50,9 @@ rule alignment_paper_tables:
     params:
         inputs=as_options,
         folder=subpath(output[0], parent=True),
-        source=code_of("alignment paper-tables"),
+        source=hash_code("alignment paper-tables"),
     message:
-        "Setting the paper's tables of scene 3 beside ours"
+        "Comparing the paper's tables of scene 3 with ours"
     shell:
         "psfdae paper alignment paper-tables {params.inputs:q} --out {params.folder}"
         " > {log} 2>&1"
@@ -68,7 +68,7 @@ rule alignment_time:
         ],
         histories=expand(
             f"{RESULTS}/alignment/{{name}}/history.csv",
-            name=["dae", *trained_networks()],
+            name=["dae", *list_trained_networks()],
         ),
     output:
         f"{RESULTS}/tables/alignment_time.csv",
@@ -82,9 +82,9 @@ rule alignment_time:
         histories=lambda w, input: [
             f"--history={Path(path).parent.name}={path}" for path in input.histories
         ],
-        source=code_of("alignment time-table"),
+        source=hash_code("alignment time-table"),
     message:
-        "Tabulating what the estimates of scene 3 cost"
+        "Tabulating the costs of the estimates of scene 3"
     shell:
         "psfdae paper alignment time-table {params.times:q} {params.histories:q} --out {output}"
         " > {log} 2>&1"
@@ -108,7 +108,7 @@ rule figure_alignment_predicted:
         f"{RESULTS}/benchmarks/alignment/figure_predicted.tsv"
     params:
         inputs=as_options,
-        source=code_of("alignment figure predicted"),
+        source=hash_code("alignment figure predicted"),
     message:
         "Drawing estimates against the truth"
     shell:
@@ -134,7 +134,7 @@ rule figure_alignment_errors:
         f"{RESULTS}/benchmarks/alignment/figure_errors.tsv"
     params:
         inputs=as_options,
-        source=code_of("alignment figure errors"),
+        source=hash_code("alignment figure errors"),
     message:
         "Drawing errors against misalignment"
     shell:
@@ -158,7 +158,7 @@ rule figure_alignment_correlation:
         f"{RESULTS}/benchmarks/alignment/figure_correlation.tsv"
     params:
         inputs=as_options,
-        source=code_of("alignment figure correlation"),
+        source=hash_code("alignment figure correlation"),
     message:
         "Drawing correlations of errors"
     shell:
@@ -181,13 +181,13 @@ rule figure_alignment_stamps:
         f"{RESULTS}/logs/alignment/figure_stamps.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/figure_stamps.tsv"
-    threads: lambda w: alignment.alignment_config(RUN).evaluation.threads
+    threads: lambda w: alignment.load_alignment_config(RUN).evaluation.threads
     resources:
         mem_mb=1000,
     params:
         config=lambda w: settings(RUN, "alignment figure stamps"),
         inputs=as_options,
-        source=code_of("alignment figure stamps"),
+        source=hash_code("alignment figure stamps"),
     message:
         "Drawing stamps of scene 3"
     shell:
@@ -213,7 +213,7 @@ rule figure_alignment_twin:
         mem_mb=1000,
     params:
         config=lambda w: settings(RUN, "alignment figure twin"),
-        source=code_of("alignment figure twin"),
+        source=hash_code("alignment figure twin"),
     message:
         "Drawing the twin ambiguity"
     shell:

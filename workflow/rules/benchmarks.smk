@@ -20,8 +20,8 @@ rule propagation:
             "propagation.measure",
             f"dataset={timings.strictest_dataset(RUN, w.scene)}",
         ),
-        source=code_of("workflow/benchmarks/propagation.py"),
-        program=program_of("propagation.measure"),
+        source=hash_code("workflow/benchmarks/propagation.py"),
+        program=locate_program("propagation.measure"),
         folder=subpath(output[0], parent=True),
     message:
         "Timing the optics of scene {wildcards.scene} against its error"
@@ -32,7 +32,7 @@ rule propagation:
 
 rule propagation_tables:
     input:
-        expand(rules.propagation.output[0], scene=datasets.scene_names()),
+        expand(rules.propagation.output[0], scene=datasets.list_scenes()),
     output:
         multiext(
             f"{RESULTS}/tables/benchmark_",
@@ -48,8 +48,8 @@ rule propagation_tables:
     resources:
         mem_mb=1000,
     params:
-        source=code_of("workflow/benchmarks/propagation.py"),
-        program=program_of("propagation.tables"),
+        source=hash_code("workflow/benchmarks/propagation.py"),
+        program=locate_program("propagation.tables"),
         folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
     message:
@@ -74,10 +74,10 @@ rule figure_benchmark:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/figure_{{drawn}}.tsv"
     wildcard_constraints:
-        drawn=any_of([*timings.figures()]),
+        drawn=match_any([*timings.figures()]),
     params:
-        source=code_of("workflow/benchmarks/figures.py"),
-        program=program_of("figures.draw"),
+        source=hash_code("workflow/benchmarks/figures.py"),
+        program=locate_program("figures.draw"),
         kind=lambda w: w.drawn.partition("_")[0],
         scene=lambda w: timings.scene_options(w.drawn),
     message:
@@ -120,13 +120,15 @@ rule seeds_of_method:
         config=lambda w: settings(
             RUN, "trainings.seeds", f"dataset={w.dataset}", name=w.method
         ),
-        source=lambda w: program_code("trainings.seeds", timings.timed_module(w.method)),
-        program=program_of("trainings.seeds"),
+        source=lambda w: program_code(
+            "trainings.seeds", timings.get_timing_module(w.method)
+        ),
+        program=locate_program("trainings.seeds"),
         method=lambda w: w.method,
         results=lambda w: RESULTS,
         references=lambda w: [
             f"--reference={r}"
-            for r in dataset_config(RUN, w.dataset).dataset.references
+            for r in load_dataset_config(RUN, w.dataset).dataset.references
         ],
     message:
         "Fitting {wildcards.method} to {wildcards.dataset} with other seeds"
@@ -140,7 +142,7 @@ rule seed_scatter:
     input:
         lambda w: [
             f"{RESULTS}/seeds/{dataset}/{name}.csv"
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for name in fits.method_names(RUN, dataset)
         ],
     output:
@@ -151,8 +153,8 @@ rule seed_scatter:
         f"{RESULTS}/benchmarks_on_request/seeds/scatter.tsv"
     localrule: True
     params:
-        source=program_code_of("trainings.scatter"),
-        program=program_of("trainings.scatter"),
+        source=hash_program("trainings.scatter"),
+        program=locate_program("trainings.scatter"),
     message:
         "Pooling the scatter between seeds"
     shell:

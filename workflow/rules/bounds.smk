@@ -11,7 +11,7 @@ rule bank:
         runtime=30,
     params:
         config=lambda w: settings(RUN, "bank", datasets.stars_choice(w.stars)),
-        source=code_of("bank"),
+        source=hash_code("bank"),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
@@ -22,7 +22,7 @@ rule dataset_bounds:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
         templates=lambda w: datasets.templates_file(
-            RUN, dataset_config(RUN, w.dataset).stars.name
+            RUN, load_dataset_config(RUN, w.dataset).stars.name
         ),
         bank=lambda w: bounds.bank_files(RUN, w.dataset),
     output:
@@ -33,13 +33,13 @@ rule dataset_bounds:
         f"{RESULTS}/logs/bounds/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/{{dataset}}.tsv"
-    threads: lambda w: dataset_config(RUN, w.dataset).bounds.threads
+    threads: lambda w: load_dataset_config(RUN, w.dataset).bounds.threads
     resources:
         mem_mb=1500,
         runtime=20,
     params:
         config=lambda w: settings(RUN, "bounds", f"dataset={w.dataset}"),
-        source=code_of("bounds"),
+        source=hash_code("bounds"),
         bank=lambda w: [f"--bank={path}" for path in bounds.bank_files(RUN, w.dataset)],
     message:
         "Bounding the errors of {wildcards.dataset}"
@@ -66,7 +66,7 @@ rule dataset_optics:
         runtime=30,
     params:
         config=lambda w: settings(RUN, "optics", f"dataset={w.dataset}"),
-        source=code_of("optics"),
+        source=hash_code("optics"),
     message:
         "Restoring {wildcards.dataset} by the optics of the telescope"
     shell:
@@ -86,7 +86,7 @@ rule psf_bounds:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
     localrule: True
     params:
-        source=code_of("collect-bounds"),
+        source=hash_code("collect-bounds"),
     message:
         "Collecting the bounds of all datasets"
     shell:
@@ -103,14 +103,14 @@ use rule psf_bounds as psf_bounds_growth with:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds_growth.tsv"
     message:
-        "Collecting how the posterior means depend on their banks"
+        "Collecting the dependence of the posterior means on their banks"
 
 
 use rule psf_bounds as psf_optics with:
     input:
         lambda w: [
             path
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for path in bounds.optics_files(RUN, dataset, "csv")
         ],
     output:
@@ -120,7 +120,7 @@ use rule psf_bounds as psf_optics with:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_optics.tsv"
     message:
-        "Collecting what the optics of the telescope restore"
+        "Collecting the errors of the methods that know the telescope"
 
 
 rule wavefront:
@@ -135,7 +135,7 @@ rule psf_efficiency:
         best=lambda w: bounds.dataset_files(RUN, ".parquet"),
         methods=lambda w: [
             path
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for path in datasets.star_errors(RUN, dataset, ["random"])
             + bounds.optics_files(RUN, dataset, "parquet")
         ],
@@ -150,7 +150,7 @@ rule psf_efficiency:
     params:
         bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
         best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
-        source=code_of("efficiency"),
+        source=hash_code("efficiency"),
     message:
         "Comparing all methods with the bounds"
     shell:
@@ -171,9 +171,9 @@ rule paper_rows:
     localrule: True
     params:
         inputs=as_options,
-        source=code_of("paper-rows"),
+        source=hash_code("paper-rows"),
     message:
-        "Setting the paper's errors beside the bounds"
+        "Comparing the paper's errors with the bounds"
     shell:
         "psfdae paper paper-rows {params.inputs:q} --out {output} > {log} 2>&1"
 
@@ -195,7 +195,7 @@ rule figure_bounds:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
     params:
-        source=code_of("figure bounds"),
+        source=hash_code("figure bounds"),
     message:
         "Drawing {wildcards.dataset}: errors above the bounds"
     shell:
@@ -220,7 +220,7 @@ rule figure_efficiency:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
     params:
-        source=code_of("figure efficiency"),
+        source=hash_code("figure efficiency"),
     message:
         "Drawing {wildcards.dataset}: efficiency"
     shell:
@@ -245,7 +245,7 @@ rule figure_bank_growth:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
     params:
-        source=code_of("figure bank-growth"),
+        source=hash_code("figure bank-growth"),
     message:
         "Drawing {wildcards.dataset}: growth of the bank"
     shell:
@@ -288,7 +288,7 @@ rule bounds:
         # The tables of the bounds have the datasets of the default target.
         lambda w: (
             rules.figure_headline.output
-            if HEADLINE_DATASET in default_datasets(RUN)
+            if HEADLINE_DATASET in list_default_datasets(RUN)
             else []
         ),
         rules.psf_bounds.output,
@@ -298,7 +298,7 @@ rule bounds:
         rules.paper_rows.output,
         lambda w: [
             file
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for file in bounds.bound_figures(RUN, dataset)
         ],
     localrule: True

@@ -2,7 +2,7 @@
 rule bundle:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
-        model=lambda w: fits.packed_files(RUN, w),
+        model=lambda w: fits.list_bundle_inputs(RUN, w),
     output:
         f"{RESULTS}/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.psf.safetensors",
     log:
@@ -11,13 +11,13 @@ rule bundle:
         f"{RESULTS}/benchmarks_on_request/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.tsv"
     wildcard_constraints:
         suffix="|".join(fits.bundle_suffixes()),
-    threads: lambda w: dataset_config(RUN, w.dataset).evaluation.threads
+    threads: lambda w: load_dataset_config(RUN, w.dataset).evaluation.threads
     resources:
         mem_mb=lambda w: fits.bundle_memory(w.suffix),
     params:
         config=lambda w: settings(RUN, "bundle", f"dataset={w.dataset}"),
         source=lambda w: fits.methods_code("bundle", [fits.bundle_suffixes()[w.suffix]]),
-        model=lambda w: fits.packed_option(RUN, w),
+        model=lambda w: fits.get_bundle_option(RUN, w),
         # A model that comes with a package is small.
         size=lambda w: ["--largest-mb=4.8"] * (w.dataset == datasets.SHIPPED_DATASET),
     message:
@@ -32,8 +32,8 @@ rule bundles:
     input:
         lambda w: [
             path
-            for dataset in default_datasets(RUN)
-            for path in fits.bundle_files(RUN, dataset, timings.PACKED)
+            for dataset in list_default_datasets(RUN)
+            for path in fits.bundle_files(RUN, dataset, timings.BUNDLE_FITS)
         ],
     localrule: True
 
@@ -43,7 +43,7 @@ rule shipped:
     input:
         stars=lambda w: datasets.stars_file(RUN, datasets.SHIPPED_DATASET),
         bundles=lambda w: fits.bundle_files(
-            RUN, datasets.SHIPPED_DATASET, timings.PACKED
+            RUN, datasets.SHIPPED_DATASET, timings.BUNDLE_FITS
         ),
     output:
         touch(f"{RESULTS}/.shipped_renewed"),
@@ -52,7 +52,7 @@ rule shipped:
     localrule: True
     params:
         config=lambda w: settings(RUN, "ship", f"dataset={datasets.SHIPPED_DATASET}"),
-        source=code_of("ship"),
+        source=hash_code("ship"),
         folder="src/psfdae/denoise/bundles",
         bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:

@@ -5,13 +5,13 @@ rule scan:
         f"{RESULTS}/logs/scan/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/scan/{{dataset}}.tsv"
-    threads: lambda w: dataset_config(RUN, w.dataset).optics.threads
+    threads: lambda w: load_dataset_config(RUN, w.dataset).optics.threads
     resources:
         mem_mb=1000,
         runtime=30,
     params:
         config=lambda w: settings(RUN, "scan", f"dataset={w.dataset}"),
-        source=code_of("scan"),
+        source=hash_code("scan"),
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
     shell:
@@ -21,9 +21,9 @@ rule scan:
 
 rule calibrate:
     input:
-        scans=expand(rules.scan.output, dataset=datasets.TABULATED),
+        scans=expand(rules.scan.output, dataset=datasets.TABLE_DATASETS),
         stars=lambda w: [
-            datasets.stars_file(RUN, dataset) for dataset in datasets.TABULATED
+            datasets.stars_file(RUN, dataset) for dataset in datasets.TABLE_DATASETS
         ],
     output:
         multiext(
@@ -37,17 +37,19 @@ rule calibrate:
         f"{RESULTS}/logs/calibrate/all.log",
     benchmark:
         f"{RESULTS}/benchmarks/calibrate/all.tsv"
-    threads: lambda w: dataset_config(RUN, datasets.TABULATED[0]).evaluation.threads
+    threads: lambda w: load_dataset_config(RUN, datasets.TABLE_DATASETS[0]).evaluation.threads
     resources:
         mem_mb=2000,
     params:
-        config=lambda w: settings(RUN, "calibrate", f"dataset={datasets.TABULATED[0]}"),
-        source=code_of("calibrate"),
+        config=lambda w: settings(
+            RUN, "calibrate", f"dataset={datasets.TABLE_DATASETS[0]}"
+        ),
+        source=hash_code("calibrate"),
         folder=subpath(output.fit, parent=True),
         scans=lambda w, input: [f"--scan={path}" for path in input.scans],
         stars=lambda w, input: [
             word
-            for dataset, path in zip(datasets.TABULATED, input.stars)
+            for dataset, path in zip(datasets.TABLE_DATASETS, input.stars)
             for word in ("--stars", dataset, path)
         ],
     message:

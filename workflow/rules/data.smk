@@ -8,7 +8,7 @@ rule templates:
     threads: lambda w: compose_choice(RUN, datasets.scene_choice(w.scene))["optics"]["threads"]
     params:
         config=lambda w: settings(RUN, "templates", datasets.scene_choice(w.scene)),
-        source=code_of("templates"),
+        source=hash_code("templates"),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
     shell:
@@ -30,7 +30,7 @@ rule stars:
         runtime=30,
     params:
         config=lambda w: settings(RUN, "stars", datasets.stars_choice(w.stars)),
-        source=code_of("stars"),
+        source=hash_code("stars"),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:

@@ -1,7 +1,7 @@
 rule evaluate:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
-        models=lambda w: fits.fitted_files(RUN, w.dataset, w.split, w.reference),
+        models=lambda w: fits.list_fit_files(RUN, w.dataset, w.split, w.reference),
     output:
         summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
         per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
@@ -10,7 +10,7 @@ rule evaluate:
         f"{RESULTS}/logs/evaluate/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/evaluate/{{dataset}}/{{split}}-{{reference}}.tsv"
-    threads: lambda w: dataset_config(RUN, w.dataset).evaluation.threads
+    threads: lambda w: load_dataset_config(RUN, w.dataset).evaluation.threads
     resources:
         mem_mb=1500,
     params:
@@ -49,7 +49,7 @@ rule paper_tables:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}.tsv"
     localrule: True
     params:
-        source=code_of("paper-tables"),
+        source=hash_code("paper-tables"),
         out=datasets.metric_options,
     message:
         "Writing the paper's tables of {wildcards.dataset}"
@@ -62,7 +62,7 @@ rule held_out:
     input:
         lambda w: [
             path
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for path in datasets.star_errors(RUN, dataset)
         ],
     output:
@@ -73,7 +73,7 @@ rule held_out:
         f"{RESULTS}/benchmarks/held_out/all.tsv"
     localrule: True
     params:
-        source=code_of("held-out"),
+        source=hash_code("held-out"),
     message:
         "Comparing held-out with seen fields, star by star"
     shell:
@@ -85,7 +85,7 @@ rule psf_metrics:
         # Evaluated only where it is asked for: a job of a cluster reads all rules at its start.
         lambda w: [
             csv
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for csv in datasets.evaluations(RUN, dataset)
         ],
     output:
@@ -96,7 +96,7 @@ rule psf_metrics:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     localrule: True
     params:
-        source=code_of("collect"),
+        source=hash_code("collect"),
     message:
         "Collecting the metrics of all datasets"
     shell:

@@ -15,7 +15,7 @@ rule figure_templates:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
     params:
         kind="templates",
-        source=code_of("figure templates"),
+        source=hash_code("figure templates"),
     message:
         "Drawing the static PSFs of scene {wildcards.scene}"
     shell:
@@ -37,7 +37,7 @@ use rule figure_templates as figure_energy with:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
     params:
         kind="energy",
-        source=code_of("figure energy"),
+        source=hash_code("figure energy"),
     message:
         "Drawing the light inside the stamps of scene {wildcards.scene}"
 
@@ -88,7 +88,7 @@ rule figure_curves:
         labels=lambda w: [
             f"--label={x}" for x in fits.histories(RUN, w.dataset).values()
         ],
-        source=code_of("figure curves"),
+        source=hash_code("figure curves"),
     message:
         "Drawing the training curves of {wildcards.dataset}"
     shell:

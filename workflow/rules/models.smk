@@ -105,7 +105,7 @@ use rule train as fit_field with:
 
 
 # Methods of other packages (entry points psfdae.methods) have rules with the names that they give.
-for _rule, _name in fits.rules_without(rule.name for rule in workflow.rules).items():
+for _rule, _name in fits.list_new_rules(rule.name for rule in workflow.rules).items():
 
     rule:
         name:

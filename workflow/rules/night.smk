@@ -17,7 +17,7 @@ rule night_images:
     params:
         rows=lambda w: night.rows_file(RUN, w.part),
         folder=f"{RESULTS}/night/images",
-        source=code_of("night images", "psfdae.methods.field"),
+        source=hash_code("night images", "psfdae.methods.field"),
     message:
         "Measuring images of part {wildcards.part}"
     shell:
@@ -36,7 +36,7 @@ rule night_table:
         f"{RESULTS}/benchmarks_on_request/night/table.tsv"
     localrule: True
     params:
-        source=code_of("night table"),
+        source=hash_code("night table"),
     message:
         "Judging the images of the night"
     shell:
@@ -55,7 +55,7 @@ rule night_page:
     localrule: True
     params:
         folder=f"{RESULTS}/night/images",
-        source=code_of("night page"),
+        source=hash_code("night page"),
     message:
         "Drawing the night"
     shell:
@@ -78,7 +78,7 @@ use rule track as track_night with:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=code_of("track"),
+        source=hash_code("track"),
     message:
         "Importing the images of the night into MLflow"
 

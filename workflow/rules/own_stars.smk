@@ -7,7 +7,7 @@ rule example_field:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/example_field.tsv"
     params:
-        source=code_of("example-field"),
+        source=hash_code("example field"),
     message:
         "Simulating an image of a star field"
     shell:
@@ -41,9 +41,9 @@ rule own_stars:
             RUN,
             "train",
             f"dataset={datasets.OWN_STARS}",
-            more=(f"methods=[{','.join(datasets.compared_methods(RUN))}]",),
+            extra=(f"methods=[{','.join(datasets.list_compared_methods(RUN))}]",),
         ),
-        source=lambda w: fits.methods_code("train", datasets.compared_methods(RUN)),
+        source=lambda w: fits.methods_code("train", datasets.list_compared_methods(RUN)),
         folder=subpath(output.bundle, parent=True),
     message:
         "Training on the bright stars of the image"
@@ -73,7 +73,7 @@ rule from_stars_example:
         f"{RESULTS}/benchmarks_on_request/own_stars/table.tsv"
     localrule: True
     message:
-        "Collecting what was learnt from the image"
+        "Collecting the results of the training on the image"
     shell:
         "( cp {input.report} {output.table} && cp {input.selection} {output.selection}"
         " && cp {input.picture} {output.picture} ) > {log} 2>&1"

@@ -6,13 +6,13 @@ use rule templates as telescope_templates with:
     benchmark:
         f"{RESULTS}/benchmarks/templates/telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars=any_of(datasets.simulated_datasets()),
-    threads: lambda w: dataset_config(RUN, w.stars).optics.threads
+        stars=match_any(datasets.list_simulated_datasets()),
+    threads: lambda w: load_dataset_config(RUN, w.stars).optics.threads
     resources:
         mem_mb=1000,
     params:
         config=lambda w: settings(RUN, "templates", f"dataset={w.stars}"),
-        source=code_of("templates"),
+        source=hash_code("templates"),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
 
@@ -27,14 +27,14 @@ use rule stars as telescope_stars with:
     benchmark:
         f"{RESULTS}/benchmarks/stars/telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars=any_of(datasets.simulated_datasets()),
-    threads: lambda w: dataset_config(RUN, w.stars).optics.threads
+        stars=match_any(datasets.list_simulated_datasets()),
+    threads: lambda w: load_dataset_config(RUN, w.stars).optics.threads
     resources:
         mem_mb=1000,
         runtime=60,
     params:
         config=lambda w: settings(RUN, "stars", f"dataset={w.stars}"),
-        source=code_of("stars"),
+        source=hash_code("stars"),
 
 
 rule figure_telescope:
@@ -54,9 +54,9 @@ rule figure_telescope:
     benchmark:
         f"{RESULTS}/benchmarks/figure_telescope/{{stars}}.tsv"
     wildcard_constraints:
-        stars=any_of(datasets.simulated_datasets()),
+        stars=match_any(datasets.list_simulated_datasets()),
     params:
-        source=code_of("figure telescope"),
+        source=hash_code("figure telescope"),
     message:
         "Drawing the static PSFs of the telescope of {wildcards.stars}"
     shell:

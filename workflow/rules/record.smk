@@ -2,7 +2,7 @@ rule runtime:
     input:
         lambda w: [
             file
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for file in datasets.products(RUN, dataset)
         ],
         rules.psf_metrics.output,
@@ -16,8 +16,8 @@ rule runtime:
     localrule: True
     params:
         results=lambda w: RESULTS,
-        source=code_of("runtime"),
+        source=hash_code("runtime"),
     message:
-        "Collecting what the jobs cost"
+        "Collecting the costs of the jobs"
     shell:
         "psfdae paper runtime --results {params.results} --out {output} > {log} 2>&1"

@@ -6,7 +6,7 @@ rule reference:
         rules.runtime.output,
         lambda w: [
             file
-            for dataset in default_datasets(RUN)
+            for dataset in list_default_datasets(RUN)
             for file in datasets.figures(RUN, dataset)
         ],
         rules.scene3.input,

@@ -48,8 +48,8 @@ rule figure_stability:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
     params:
-        source=code_of("workflow/benchmarks/figures.py"),
-        program=program_of("figures.draw"),
+        source=hash_code("workflow/benchmarks/figures.py"),
+        program=locate_program("figures.draw"),
     message:
         "Drawing error against stress"
     shell:

@@ -1,5 +1,5 @@
 wildcard_constraints:
-    sweep=any_of(sweep_names()),
+    sweep=match_any(list_sweeps()),
 
 
 # States of their own choose between networks: all others train or test.
@@ -17,7 +17,7 @@ use rule alignment_states as sweep_validation_states with:
         config=lambda w: settings(
             RUN,
             "alignment states",
-            more=(f"seed={alignment.alignment_config(RUN).seed + 1}",),
+            extra=(f"seed={alignment.load_alignment_config(RUN).seed + 1}",),
         ),
     message:
         "Propagating the stamps of scene 3, uniform states that choose between networks"
@@ -80,7 +80,7 @@ rule sweep_summary:
     params:
         given=RUN.overrides,
         definition=lambda w: sweeps.sweep_plan(RUN, w.sweep).sweep.model_dump_json(),
-        source=code_of("sweep summary"),
+        source=hash_code("sweep summary"),
         points=lambda w: f"{RESULTS}/sweeps/{w.sweep}/points",
         folder=subpath(output.summary, parent=True),
     message:
@@ -106,12 +106,12 @@ rule figure_sweep:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{sweep_figure}}.tsv"
     wildcard_constraints:
-        sweep_figure=any_of(sweeps.FIGURES),
+        sweep_figure=match_any(sweeps.FIGURES),
     threads: 1
     resources:
         mem_mb=500,
     params:
-        source=code_of("sweep figure"),
+        source=hash_code("sweep figure"),
     message:
         "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
     shell:
@@ -140,7 +140,7 @@ rule track_sweep:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=code_of("track"),
+        source=hash_code("track"),
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
     shell:

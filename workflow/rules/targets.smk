@@ -4,8 +4,8 @@ rule tables:
         rules.held_out.output,
         lambda w: [
             file
-            for dataset in datasets.TABULATED
-            if dataset in default_datasets(RUN)
+            for dataset in datasets.TABLE_DATASETS
+            if dataset in list_default_datasets(RUN)
             for file in datasets.paper_tables(RUN, dataset)
         ],
     localrule: True
@@ -40,7 +40,7 @@ rule scene3:
 
 rule tracking:
     input:
-        lambda w: expand(rules.track.output, dataset=default_datasets(RUN)),
+        lambda w: expand(rules.track.output, dataset=list_default_datasets(RUN)),
         rules.track_alignment.output,
     localrule: True
 
@@ -100,7 +100,7 @@ rule field:
 
 
 # A target for each further file of config/dataset.
-for _dataset in datasets.datasets_without(rule.name for rule in workflow.rules):
+for _dataset in datasets.list_datasets_except(rule.name for rule in workflow.rules):
 
     rule:
         name:

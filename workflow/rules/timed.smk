@@ -1,6 +1,6 @@
 # Timings: each takes all cores, so that no other job disturbs it, and leaves one table; others,
 # which measure no time, run side by side.
-# Programs are those of workflow/benchmarks, by file and function.
+# Programs are in workflow/benchmarks, named by file and function.
 rule cost:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
@@ -22,11 +22,11 @@ rule cost:
             RUN,
             "costs.cost",
             f"dataset={w.dataset}",
-            more=timings.timed_overrides(w),
+            extra=timings.get_point_overrides(w),
             name=w.method,
         ),
-        source=lambda w: program_code("costs.cost", timings.timed_module(w.method)),
-        program=program_of("costs.cost"),
+        source=lambda w: program_code("costs.cost", timings.get_timing_module(w.method)),
+        program=locate_program("costs.cost"),
         inputs=as_options,
     message:
         "Timing {wildcards.method}, {wildcards.point}, on {wildcards.dataset}"
@@ -47,9 +47,9 @@ rule benchmark_costs:
         f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_costs.tsv"
     localrule: True
     params:
-        source=program_code_of("costs.costs"),
-        program=program_of("costs.costs"),
-        points=lambda w: repr(timings.timed_points()),
+        source=hash_program("costs.costs"),
+        program=locate_program("costs.costs"),
+        points=lambda w: repr(timings.load_timing_points()),
     message:
         "Joining errors and times of all methods"
     shell:
@@ -69,9 +69,11 @@ rule benchmark_inference:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "speed.inference", timings.timed_choice()),
-        source=program_code_of("speed.inference"),
-        program=program_of("speed.inference"),
+        config=lambda w: settings(
+            RUN, "speed.inference", timings.choose_timing_dataset()
+        ),
+        source=hash_program("speed.inference"),
+        program=locate_program("speed.inference"),
     message:
         "Measuring for the table benchmark_inference"
     shell:
@@ -92,9 +94,9 @@ rule benchmark_scaling:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "speed.growth", timings.timed_choice()),
-        source=program_code_of("speed.growth", "templates", "stars", "predict"),
-        program=program_of("speed.growth"),
+        config=lambda w: settings(RUN, "speed.growth", timings.choose_timing_dataset()),
+        source=hash_program("speed.growth", "templates", "stars", "predict"),
+        program=locate_program("speed.growth"),
     message:
         "Measuring for the table benchmark_scaling"
     shell:
@@ -104,9 +106,9 @@ rule benchmark_scaling:
 
 rule predict_throughput:
     input:
-        stars=lambda w: datasets.stars_file(RUN, timings.timed_dataset()),
-        bundle=lambda w: timings.timed_bundle(RUN, "dae"),
-        mixture=lambda w: timings.timed_bundle(RUN, "gmm"),
+        stars=lambda w: datasets.stars_file(RUN, timings.get_timing_dataset()),
+        bundle=lambda w: timings.get_timing_bundle(RUN, "dae"),
+        mixture=lambda w: timings.get_timing_bundle(RUN, "gmm"),
     output:
         f"{RESULTS}/tables/predict_throughput.csv",
     log:
@@ -119,9 +121,11 @@ rule predict_throughput:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "prediction.throughput", timings.timed_choice()),
-        source=program_code_of("prediction.throughput", "predict"),
-        program=program_of("prediction.throughput"),
+        config=lambda w: settings(
+            RUN, "prediction.throughput", timings.choose_timing_dataset()
+        ),
+        source=hash_program("prediction.throughput", "predict"),
+        program=locate_program("prediction.throughput"),
         inputs=as_options,
     message:
         "Measuring for the table predict_throughput"
@@ -132,7 +136,7 @@ rule predict_throughput:
 
 rule predict_poppy:
     input:
-        bundle=lambda w: timings.timed_bundles(RUN),
+        bundle=lambda w: timings.list_timing_bundles(RUN),
     output:
         f"{RESULTS}/tables/predict_poppy.csv",
     log:
@@ -144,9 +148,11 @@ rule predict_poppy:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "prediction.poppy", timings.timed_choice()),
-        source=program_code_of("prediction.poppy"),
-        program=program_of("prediction.poppy"),
+        config=lambda w: settings(
+            RUN, "prediction.poppy", timings.choose_timing_dataset()
+        ),
+        source=hash_program("prediction.poppy"),
+        program=locate_program("prediction.poppy"),
         inputs=as_options,
         limit=lambda w: [f"--count={timings.poppy_stars(RUN)}"],
     message:
@@ -159,11 +165,11 @@ rule predict_poppy:
 rule predict_coverage:
     input:
         stars=lambda w: [
-            datasets.stars_file(RUN, timings.timed_dataset()),
+            datasets.stars_file(RUN, timings.get_timing_dataset()),
             f"{RESULTS}/own_stars/example/model/stars.h5",
         ],
         bundle=lambda w: [
-            *timings.timed_bundles(RUN),
+            *timings.list_timing_bundles(RUN),
             f"{RESULTS}/own_stars/example/model/example.psf.safetensors",
         ],
     output:
@@ -177,9 +183,11 @@ rule predict_coverage:
         runtime=30,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "prediction.coverage", timings.timed_choice()),
-        source=program_code_of("prediction.coverage"),
-        program=program_of("prediction.coverage"),
+        config=lambda w: settings(
+            RUN, "prediction.coverage", timings.choose_timing_dataset()
+        ),
+        source=hash_program("prediction.coverage"),
+        program=locate_program("prediction.coverage"),
         inputs=as_options,
     message:
         "Measuring for the table predict_coverage"
@@ -190,8 +198,8 @@ rule predict_coverage:
 
 rule predict_strange:
     input:
-        stars=lambda w: datasets.stars_file(RUN, timings.timed_dataset()),
-        bundle=lambda w: timings.timed_bundle(RUN, "gmm"),
+        stars=lambda w: datasets.stars_file(RUN, timings.get_timing_dataset()),
+        bundle=lambda w: timings.get_timing_bundle(RUN, "gmm"),
     output:
         f"{RESULTS}/tables/predict_strange.csv",
     log:
@@ -203,9 +211,11 @@ rule predict_strange:
         runtime=20,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "prediction.outliers", timings.timed_choice()),
-        source=program_code_of("prediction.strange"),
-        program=program_of("prediction.strange"),
+        config=lambda w: settings(
+            RUN, "prediction.outliers", timings.choose_timing_dataset()
+        ),
+        source=hash_program("prediction.strange"),
+        program=locate_program("prediction.strange"),
         inputs=as_options,
     message:
         "Measuring for the table predict_strange"
@@ -227,11 +237,11 @@ rule scaling_stages:
         runtime=60,
         disk_mb=2000,
     params:
-        config=lambda w: settings(RUN, "speed.stages", timings.timed_choice()),
-        source=program_code_of(
+        config=lambda w: settings(RUN, "speed.stages", timings.choose_timing_dataset()),
+        source=hash_program(
             "speed.stages", "templates", "stars", "fit", "evaluate", "predict"
         ),
-        program=program_of("speed.stages"),
+        program=locate_program("speed.stages"),
     message:
         "Measuring for the table scaling_stages"
     shell:

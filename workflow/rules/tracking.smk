@@ -17,7 +17,7 @@ rule track:
         preset=PRESET,
         # Not an output: Snakemake would delete it, and with it the runs of older configs.
         database=f"{RESULTS}/mlflow.db",
-        source=code_of("track"),
+        source=hash_code("track"),
     message:
         "Importing the runs of {wildcards.dataset} into MLflow"
     shell:
@@ -29,7 +29,7 @@ use rule track as track_alignment with:
     input:
         rules.alignment_tables.output.errors,
         rules.alignment_dae.output,
-        expand(rules.alignment_network.output, network=trained_networks()),
+        expand(rules.alignment_network.output, network=list_trained_networks()),
         rules.figure_alignment_predicted.output,
         rules.figure_alignment_errors.output,
         rules.figure_alignment_correlation.output,
@@ -46,6 +46,6 @@ use rule track as track_alignment with:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=code_of("track"),
+        source=hash_code("track"),
     message:
         "Importing the runs of scene 3 into MLflow"

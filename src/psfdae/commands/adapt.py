@@ -24,10 +24,14 @@ def adapt_command(
 ) -> None:
     """Adapt MODEL to IMAGE, another exposure of the same camera with few bright stars.
 
-    The stars of IMAGE show how its PSF differs from that of MODEL; ten may be enough.
+    The stars of IMAGE show how its PSF differs from the PSF of MODEL; ten may be enough.
 
     Parameters
     ----------
+    image : Path
+        FITS image.
+    options : ImageOptions
+        Options of the image, and its star list.
     overwrite : bool
         Replace a file that exists.
     model : Path
@@ -38,8 +42,8 @@ def adapt_command(
     # Refuse wrong options and files that exist before anything is computed.
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), model), out, overwrite=overwrite)
-    loaded = StarModel.load(model)
+    star_model = StarModel.load(model)
 
-    adapted, sentence = adapt_to_exposure(loaded, source, out.name.removesuffix(SUFFIX))
-    adapted.save(out)
+    adapted_model, sentence = adapt_to_exposure(star_model, source, out.name.removesuffix(SUFFIX))
+    adapted_model.save(out)
     print(f"{out}: {sentence}")

@@ -67,7 +67,7 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
     Parameters of the function are options: required without a default, repeatable as
     `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated` adds a click type, or a
     dict of what click's option takes, where "flag" names it and "argument" makes it positional.
-    Help of the command is the docstring; that of an option is its entry under Parameters, or a text
+    Help of the command is the docstring; help of an option is its entry under Parameters, or a text
     in `Annotated`.
 
     Parameters
@@ -95,7 +95,7 @@ class Careful(click.Group):
     """Group of commands in which wrong input ends in one line and exit code 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command, and print one line for an error that is no bug of the package.
+        """Run a command, and print one line for an error that is not a bug of the package.
 
         Such errors are wrong input, a file that cannot be read or written, a lack of memory, and a
         missing package that belongs to an extra. A bug ends in a traceback.
@@ -111,7 +111,7 @@ class Careful(click.Group):
 
 
 def refusal(error: Exception) -> str | None:
-    """Return the line for an error that is no bug; None if it is one."""
+    """Return the line for an error that is not a bug; None if it is one."""
     # Errors of Python that say what the machine lacks, then the package's own.
     if isinstance(error, MemoryError):
         return f"not enough memory ({error or 'no more is known'})"
@@ -134,8 +134,8 @@ class Commands(Careful):
         self.prefix = prefix
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the words that may follow those of the group."""
-        # Commands have up to four words; the first ones are those of the group.
+        """Return the words that may follow the group's words."""
+        # Commands have up to four words; the first ones belong to the group.
         prefix = self.prefix.split()
         size = len(prefix)
         names = [name.split() for name in command_modules()]
@@ -168,9 +168,9 @@ class Commands(Careful):
         """List the commands with the first sentence of their help, from the modules' text."""
         # Sentences are cut to what a line has room for beside the longest name.
         words = self.list_commands(ctx)
-        listed = {"Commands": words} if self.prefix else sections(words)
+        sections_of_words = {"Commands": words} if self.prefix else sections(words)
         width = formatter.width - 6 - max(map(len, words))
-        for heading, commands in listed.items():
+        for heading, commands in sections_of_words.items():
             with formatter.section(heading):
                 rows = []
                 for word in commands:
@@ -180,7 +180,7 @@ class Commands(Careful):
                     sentence += "." if len(sentence) < width else ""
                     rows.append((word, shorten(sentence, width, placeholder="...")))
                 formatter.write_dl(rows)
-        if absent := len(words) - sum(map(len, listed.values())):
+        if absent := len(words) - sum(map(len, sections_of_words.values())):
             formatter.write_paragraph()
             formatter.write_text(f'{absent} more with the extra "paper": {install_line("paper")}')
 
@@ -196,12 +196,12 @@ class SettingsCommand(click.Command):
     """Options that are fields of a dataclass, by the heading of their group in the help."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the options of the command, then those of each dataclass below a heading."""
-        grouped = [option for options in self.field_options.values() for option in options]
+        """List the options of the command, then the options of each dataclass below a heading."""
+        fields = [option for options in self.field_options.values() for option in options]
         own: list[click.Parameter] = [
             option
             for option in self.get_params(ctx)
-            if isinstance(option, click.Option) and option not in grouped
+            if isinstance(option, click.Option) and option not in fields
         ]
         for heading, options in {"Options": own, **self.field_options}.items():
             records = [option.get_help_record(ctx) for option in options]
@@ -210,7 +210,7 @@ class SettingsCommand(click.Command):
                     formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; `--quiet` is no parameter of its function."""
+        """Run the command; `--quiet` is not a parameter of its function."""
         with use_command_words():
             return self.invoke_displayed(ctx)
 
@@ -345,7 +345,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     """Return the click command of a function that `command` has marked."""
     spec: Stage = function.stage  # type: ignore[attr-defined]
     # Parameters of the function are options; a dataclass has an option for each of its fields.
-    help_text, meanings = described_parameters(function)
+    help_text, meanings = read_docstring(function)
     dataclasses: dict[str, Any] = {}
     field_options: dict[str, list[click.Parameter]] = {}
     parameters: list[click.Parameter] = []
@@ -384,7 +384,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
             values[name] = dataclass_type(**{key: values.pop(key) for key in names})
         function(**config, **values)
 
-    # The last word is the command's own; the others are those of its groups.
+    # The last word is the command's own; the others belong to its groups.
     word = spec.name.split()[-1]
     click_command = SettingsCommand(word, callback=run, params=parameters, help=help_text)
     click_command.field_options = field_options
@@ -392,7 +392,7 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     return click_command
 
 
-def described_parameters(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+def read_docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
     """Return the docstring of a function up to its parameters, and their meanings by name."""
     # In numpydoc's form a name begins a line, and its meaning is indented below it.
     help_text, _, section = cleandoc(function.__doc__ or "").partition(
@@ -436,7 +436,7 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     return settings
 
 
-def typed_words(options: Any) -> list[str]:
+def format_as_words(options: Any) -> list[str]:
     """Return the fields of a dataclass that differ from their defaults, as options are typed."""
     words = []
     for name, hint, default in _parameters(type(options)):
@@ -446,7 +446,7 @@ def typed_words(options: Any) -> list[str]:
     return words
 
 
-def typed_values(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
+def parse_options(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return values of a dataclass's fields from texts by name, as options take them.
 
     Names of no field and empty texts are left out.
@@ -454,7 +454,7 @@ def typed_values(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
     Raises
     ------
     Error
-        If a text is no value of its field; names both.
+        If a text is not a value of its field; names both.
     """
     values = {}
     for name, hint, default in _parameters(options):
@@ -467,7 +467,7 @@ def typed_values(options: Any, texts: Mapping[str, str]) -> dict[str, Any]:
 
 
 def program(*functions: Callable[..., Any]) -> None:
-    """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
+    """Run commands of a program outside the package, such as of `workflow/benchmarks`."""
     Careful(commands=[as_click(function) for function in functions])()
 
 
@@ -488,16 +488,16 @@ def _option(name: str, hint: Any, default: Any, meaning: str | None = None) -> c
     if value_type is bool:
         attributes |= {"type": None, "is_flag": True}
     # A parameter without a default must be given.
-    required = default is Parameter.empty
+    is_required = default is Parameter.empty
     if attributes.pop("argument", False):
         nargs = -1 if attributes.pop("multiple", False) else 1
-        # Before version 8.5, arguments of click have no help.
+        # Before version 8.5, arguments of click do not take a help text.
         if "help" not in signature(click.Argument).parameters:
             attributes.pop("help", None)
-        return click.Argument([name], required=required, nargs=nargs, **attributes)
+        return click.Argument([name], required=is_required, nargs=nargs, **attributes)
     # The help shows a default, unless it is that nothing is given.
-    attributes["required"] = required
-    if not required and default is not False and default not in (None, ()):
+    attributes["required"] = is_required
+    if not is_required and default is not False and default not in (None, ()):
         attributes = {"default": default, "show_default": True, **attributes}
     flag = attributes.pop("flag", f"--{name.replace('_', '-')}")
     return click.Option([flag, name], **attributes)

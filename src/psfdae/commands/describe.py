@@ -25,6 +25,7 @@ def description(bundle: Bundle) -> str:
     Parameters
     ----------
     bundle : Bundle
+        Model to describe.
     """
     # Names are padded to the longest one, so that all facts begin in the same column.
     facts = model_facts(bundle)

@@ -25,6 +25,10 @@ def detect_command(
 
     Parameters
     ----------
+    image : Path
+        FITS image.
+    options : ImageOptions
+        Options of the image, and its star list.
     overwrite : bool
         Replace a file that exists.
     out : Path

@@ -31,7 +31,7 @@ class MosaicError(Error, RuntimeError):
 def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOptions]:
     """Return the options of each image of a file by the image's name (`science_images`).
 
-    A star list is that of all images: each image takes the stars that are on it.
+    A star list is for all images: each image takes the stars that are on it.
 
     Raises
     ------
@@ -41,10 +41,10 @@ def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOption
     # An extension name, the origin of a list in pixels, or a map of the pixels' noise is
     # right for one image, and cannot be given for several.
     one_image_options = ("extension", "origin", "mask", "weight", "variance", "error")
-    excluded = [f"--{name}" for name in one_image_options if getattr(options, name) is not None]
-    if excluded:
-        raise ObservationError(path, f"--all-extensions excludes {' and '.join(excluded)}")
-    # Pixels of a list are those of one image.
+    clashes = [f"--{name}" for name in one_image_options if getattr(options, name) is not None]
+    if clashes:
+        raise ObservationError(path, f"--all-extensions excludes {' and '.join(clashes)}")
+    # Pixel positions of a list are for one image.
     if options.catalogue is not None:
         require_sky(options.catalogue, "--all-extensions")
     # An image is named by its number, since names of extensions may repeat.
@@ -52,7 +52,7 @@ def options_by_image(path: Path, options: ImageOptions) -> dict[str, ImageOption
     return {name: replace(one_image, extension=n) for name, n in science_images(path).items()}
 
 
-def path_of_image(path: Path | None, name: str) -> Path | None:
+def name_image_path(path: Path | None, name: str) -> Path | None:
     """Return the output file of one image: the stem of `path` gets the name of the image."""
     return path and path.with_name(f"{path.stem}_{name}{path.suffix}")
 
@@ -87,21 +87,21 @@ def run_for_images(
                 return False, "its process was killed, perhaps for lack of memory"
 
     # A thread waits for each process; one that is killed stops no other.
-    failed = []
+    failed_images = []
     with ThreadPoolExecutor(min(len(jobs), available_cores())) as threads:
-        for name, (succeeded, message) in zip(jobs, threads.map(run, jobs.values()), strict=True):
-            failed += [] if succeeded else [name]
+        for name, (is_done, message) in zip(jobs, threads.map(run, jobs.values()), strict=True):
+            failed_images += [] if is_done else [name]
             print(f"{name}: {message}", flush=True)
-    if failed:
+    if failed_images:
         raise MosaicError(
-            f"{path}: {len(failed)} of {len(jobs)} images failed: {', '.join(failed)}"
+            f"{path}: {len(failed_images)} of {len(jobs)} images failed: {', '.join(failed_images)}"
         )
 
 
 def _run_quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:
     """Run `work` without its output; return True and its sentence, or False and the refusal.
 
-    Errors that are no refusals of wrong input, that is, bugs, are raised again.
+    Errors other than wrong input, that is, bugs, are raised again.
     """
     with Path(os.devnull).open("w") as null, redirect_stdout(null), redirect_stderr(null):
         try:

@@ -13,7 +13,7 @@ from psfdae.commands.predict import check_targets
 from psfdae.denoise.field_models import load_field
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import SUFFIXES, write_table
-from psfdae.photometry.image_photometry import PhotometryError, photometry_of_image
+from psfdae.photometry.image_photometry import PhotometryError, measure_all_stars
 
 
 @command("photometry")
@@ -31,12 +31,16 @@ def photometry_command(
 ) -> None:
     """Measure the fluxes of all stars of IMAGE, overlapping ones together.
 
-    --detect finds the stars, and with the PSF those that are faint or hidden; those of
-    --catalogue are measured where it says, and no others. Fluxes have the light beyond the
+    --detect finds the stars, and with the PSF also faint and hidden ones; the stars of
+    --catalogue are measured at its positions, and no others. Fluxes have the light beyond the
     stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
 
     Parameters
     ----------
+    image : Path
+        FITS image.
+    options : ImageOptions
+        Options of the image, and its star list.
     zero_point : float, optional
         Magnitude of a flux of 1.
     reference : Path, optional
@@ -58,7 +62,7 @@ def photometry_command(
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), reference, model), out, residual, overwrite=overwrite)
     # Measure all stars, and write the table and the residual image, both or none.
-    photometry = photometry_of_image(
+    photometry = measure_all_stars(
         load_field(model), source, zero_point, reference, magnitude_column
     )
     with rename_together(out):

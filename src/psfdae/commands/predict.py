@@ -18,7 +18,7 @@ from psfdae.base.figures import write_png
 from psfdae.base.files import atomic_path, check_outputs, is_cut_off, rename_together
 from psfdae.base.options import File
 from psfdae.commands.cli import command
-from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
+from psfdae.commands.mosaic import name_image_path, options_by_image, run_for_images
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.denoise.image_prediction import notes_on_model, offsets_from_list, open_for_model
 from psfdae.denoise.prediction import prediction_file
@@ -62,6 +62,10 @@ def predict_command(
 
     Parameters
     ----------
+    stars : Path
+        FITS image, or FITS cube of stamps.
+    options : ImageOptions
+        Options of the image, and its star list.
     all_extensions : bool
         All images of the file, each by itself and in parallel; OUT gets their names.
     flux_column : str, optional
@@ -89,10 +93,10 @@ def predict_command(
                 **job,
                 "options": image_options,
                 "all_extensions": False,
-                "model": bundle_of_image(model, name),
-                "plot": path_of_image(plot, name),
+                "model": find_bundle(model, name),
+                "plot": name_image_path(plot, name),
                 "threads": 1,
-                "out": path_of_image(out, name),
+                "out": name_image_path(out, name),
             }
             for name, image_options in options_by_image(stars, options).items()
         }
@@ -103,37 +107,37 @@ def predict_command(
         stars, **vars(options), flux_column=flux_column, background_column=background_column
     )
     list_path = out.with_name(f"{out.stem}_stars.csv") if options.detect else None
-    bundle = bundle_of_image(model, source.name)
+    bundle = find_bundle(model, source.name)
     check_targets((*source.files(), bundle), out, plot, list_path, overwrite=overwrite)
-    loaded = StarModel.load(bundle)
-    observation = open_for_model(loaded, source, fixed_positions)
+    denoiser = StarModel.load(bundle)
+    observation = open_for_model(denoiser, source, fixed_positions)
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     try:
         # The FITS file gets its name last: if it exists, everything is done.
-        with rename_together(out), atomic_path(out) as unfinished:
-            flag_counts, unflagged, list_note = write_prediction(
-                loaded, source, observation, unfinished, threads, fixed_positions
+        with rename_together(out), atomic_path(out) as temporary_path:
+            flag_counts, unflagged_count, list_note = write_prediction(
+                denoiser, source, observation, temporary_path, threads, fixed_positions
             )
             if list_path is not None:
                 write_list(observation, list_path)
             if plot is not None:
-                write_png(read_psf_map(unfinished), plot)
+                write_png(read_psf_map(temporary_path), plot)
     except OSError as error:
         name = error.filename or out
         raise PredictionError(f"{name}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
     unlike_count = int(flag_counts[[*StarFlag].index(StarFlag.UNLIKE_TRAINING)])
-    lines = [observation.summary(), list_note, *notes_on_model(loaded, observation, unlike_count)]
-    lines.append(f"{out}: {observation.count} stars, {unflagged} without a flag")
-    flagged = zip(StarFlag, flag_counts, strict=True)
-    lines += [f"  {flag.name}: {count}" for flag, count in flagged if count]
+    lines = [observation.summary(), list_note, *notes_on_model(denoiser, observation, unlike_count)]
+    lines.append(f"{out}: {observation.count} stars, {unflagged_count} without a flag")
+    counts_by_flag = zip(StarFlag, flag_counts, strict=True)
+    lines += [f"  {flag.name}: {count}" for flag, count in counts_by_flag if count]
     summary = "\n".join(line for line in lines if line)
     print(summary)
     return summary
 
 
-def bundle_of_image(model: Path | None, name: str) -> Path | None:
+def find_bundle(model: Path | None, name: str) -> Path | None:
     """Return the bundle of an image, if `model` is a folder with one for each; else `model`.
 
     `train` leaves NAME.psf.safetensors in the folder itself, or with --all-extensions
@@ -142,7 +146,7 @@ def bundle_of_image(model: Path | None, name: str) -> Path | None:
     Raises
     ------
     PredictionError
-        If the folder has no bundle of this image, or several.
+        If the folder does not have exactly one bundle of this image.
     """
     if model is None or not model.is_dir():
         return model
@@ -157,7 +161,7 @@ def bundle_of_image(model: Path | None, name: str) -> Path | None:
 def check_targets(
     inputs: Sequence[object], out: Path, *other_outputs: Path | None, overwrite: bool
 ) -> None:
-    """Refuse outputs that exist, unless `overwrite` is set or they are of this command, killed.
+    """Raise an error for existing outputs, unless `overwrite` is set or a killed run left them.
 
     Parameters
     ----------
@@ -165,7 +169,10 @@ def check_targets(
         All that the command reads.
     out : Path
         The output; none of the others may have its name.
-    other_outputs : Path or None
+    *other_outputs : Path or None
+        Further outputs; None is left out.
+    overwrite : bool
+        Existing outputs are replaced.
 
     Raises
     ------
@@ -198,7 +205,7 @@ def write_prediction(
     -------
     flag_counts : ndarray of int, shape (flags,)
         Number of stars with each `StarFlag`.
-    unflagged : int
+    unflagged_count : int
         Number of stars without any flag.
     list_note : str or None
         A sentence on how far the stars are off the positions of their list.
@@ -208,19 +215,19 @@ def write_prediction(
     ObservationError
         If the positions of the list are far off (`list_offset`); nothing is left of the file.
     """
-    # The first stars tell the types of the columns.
+    # The first stars give the types of the columns.
     pieces = model.stream(observation, threads, fixed_positions)
     first_piece = next(pieces)
     flag_counts = np.zeros(len(StarFlag), dtype=int)
-    star_index, unflagged, offsets = 0, 0, []
+    star_index, unflagged_count, offsets = 0, 0, []
     # Header cards: the file, its pixel scale, the star list, and what is known of the detector.
-    assumed = ", assumed" if observation.scale_assumed else ""
+    scale_note = ", assumed" if observation.scale_assumed else ""
     scale = observation.pixel_scale_arcsec
     cards: list[Card] = [
         ("INFILE", source.path.name, "stars"),
-        ("PIXSCALE", scale, f"[arcsec] width of a pixel{assumed}"),
+        ("PIXSCALE", scale, f"[arcsec] width of a pixel{scale_note}"),
     ]
-    # What is not known has no card.
+    # Unknown values have no card.
     if observation.catalogue is not None:
         cards.append(("CATALOG", observation.catalogue.name, "star list"))
     if observation.gain is not None:
@@ -235,8 +242,8 @@ def write_prediction(
         for stamps, prediction in itertools.chain([first_piece], pieces):
             file.write(star_index, prediction)
             flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
-            unflagged += int((prediction.flags == 0).sum())
+            unflagged_count += int((prediction.flags == 0).sum())
             offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
             star_index += len(prediction)
         note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
-    return flag_counts, unflagged, note if observation.shape else None
+    return flag_counts, unflagged_count, note if observation.shape else None

@@ -37,6 +37,8 @@ def psf(
 
     Parameters
     ----------
+    model : Path
+        Model that knows the PSF over the field.
     at : sequence of str
         X,Y of a place, 0-based pixels; again for more.
     grid : str, optional
@@ -59,34 +61,34 @@ def psf(
     oversampling = oversampling or (8 if for_psfex else 4)
     if for_stdpsf and (at or oversampling != 4):
         raise PredictionError(f"{out}: STDPSF has a --grid, and 4 values per pixel and axis")
-    loaded = load_field(model)
+    field_model = load_field(model)
     if for_psfex:
         # The polynomial of PSFEx's format does not hold the model exactly: print the error.
-        error = exchange.write_psfex(out, loaded, oversampling)
+        error = exchange.write_psfex(out, field_model, oversampling)
         print(
             f"{out}: within {error:.1g} of the brightest value of {model} at the places looked at"
         )
         return
-    # Places as they are stated, or the knots of a grid over the places of the training stars.
+    # The given positions, or the nodes of a grid over the positions of the training stars.
     grid_shape = None if grid is None else _grid_shape(grid)
     if grid_shape is None:
         positions = np.array([_position(text) for text in at])
     else:
-        positions = loaded.grid(*grid_shape)
+        positions = field_model.grid(*grid_shape)
     # What the user should know of these places, then the file.
-    for note in _notes(loaded, positions):
+    for note in _notes(field_model, positions):
         print(f"{model}: {note}")
     reader = "photutils, as STDPSF"
     if for_stdpsf and grid_shape is not None:
-        exchange.write_stdpsf(out, loaded, *grid_shape)
+        exchange.write_stdpsf(out, field_model, *grid_shape)
     else:
-        exchange.write_grid(out, loaded, positions, oversampling)
+        exchange.write_grid(out, field_model, positions, oversampling)
         reader = "photutils 3.1 or newer (an older one reads NAME.stdpsf.fits)"
     print(f"{out}: {len(positions)} PSFs, for {reader}")
 
 
 def _position(text: str) -> tuple[float, float]:
-    """Return the pixel position (x, y) that an option --at states as X,Y."""
+    """Return the pixel position (x, y) of an option --at X,Y."""
     try:
         x, y = map(float, text.split(","))
         return x, y
@@ -95,7 +97,7 @@ def _position(text: str) -> tuple[float, float]:
 
 
 def _grid_shape(text: str) -> tuple[int, int]:
-    """Return the columns and rows of a grid that the option --grid states as COLUMNSxROWS."""
+    """Return the columns and rows of a grid of the option --grid COLUMNSxROWS."""
     match = re.fullmatch(r"([0-9]{1,3})x([0-9]{1,3})", text.strip())
     columns, rows = map(int, match.groups()) if match else (0, 0)
     if min(columns, rows) < 2:
@@ -109,6 +111,7 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
     Parameters
     ----------
     model : FieldPsfs
+        Model that knows the PSF at every position.
     positions : ndarray, shape (n, 2)
         x and y in px.
 
@@ -135,10 +138,10 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
         low, high = model.field_range()
     except PredictionError:  # stars without positions have one PSF, which holds everywhere
         low, high = np.full(2, -np.inf), np.full(2, np.inf)
-    extrapolated = int(((positions < low) | (positions > high)).any(axis=1).sum())
-    if extrapolated:
+    outside_count = int(((positions < low) | (positions > high)).any(axis=1).sum())
+    if outside_count:
         notes.append(
-            f"{extrapolated} of {len(positions)} places are beyond the training stars, "
+            f"{outside_count} of {len(positions)} places are beyond the training stars, "
             f"x {low[0]:.6g} … {high[0]:.6g}, y {low[1]:.6g} … {high[1]:.6g}; the PSF there is "
             "that of their edge"
         )

@@ -10,7 +10,7 @@ from psfdae.commands.cli import command
 from psfdae.commands.predict import check_targets
 from psfdae.denoise.field_models import load_field
 from psfdae.image.image_input import ImageInput, ImageOptions
-from psfdae.photometry.image_photometry import photometry_of_image
+from psfdae.photometry.image_photometry import measure_all_stars
 
 
 @command("residual")
@@ -26,6 +26,10 @@ def residual_command(
 
     Parameters
     ----------
+    image : Path
+        FITS image.
+    options : ImageOptions
+        Options of the image, and its star list.
     overwrite : bool
         Replace a file that exists.
     model : Path
@@ -35,6 +39,6 @@ def residual_command(
     """
     source = ImageInput(image, **vars(options))
     check_targets((*source.files(), model), out, overwrite=overwrite)
-    photometry = photometry_of_image(load_field(model), source)
+    photometry = measure_all_stars(load_field(model), source)
     write_fits(out, photometry.residual.to_hdu()[0])
     print(f"{out}: {len(photometry.table)} stars subtracted", *photometry.notes, sep="\n")

@@ -22,8 +22,8 @@ from psfdae.base.files import (
 )
 from psfdae.base.options import File, Folder
 from psfdae.base.settings import ConfigError, as_overrides
-from psfdae.commands.cli import command, typed_words
-from psfdae.commands.mosaic import options_by_image, path_of_image, run_for_images
+from psfdae.commands.cli import command, format_as_words
+from psfdae.commands.mosaic import name_image_path, options_by_image, run_for_images
 from psfdae.commands.predict import write_list
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.image.errors import ObservationError
@@ -36,7 +36,7 @@ from psfdae.report.validation import validate
 from psfdae.training.exposures import adapt_to_exposures
 from psfdae.training.fitting import (
     choose_method,
-    described,
+    describe_settings,
     fit_method,
     makes_models,
     pack_model,
@@ -94,9 +94,9 @@ class ModelFiles:
     @property
     def bundle(self) -> Path:
         """Bundle of the model, for all images together if there are several."""
-        return self.bundle_of(self.name)
+        return self.locate_bundle(self.name)
 
-    def bundle_of(self, exposure: str) -> Path:
+    def locate_bundle(self, exposure: str) -> Path:
         """Return the path of the bundle of one exposure."""
         return self.path / f"{exposure}{SUFFIX}"
 
@@ -106,7 +106,7 @@ class ModelFiles:
         paths = [self.path / name for name in names]
         for method_class in self.methods:
             paths += fits.outputs(method_class, self.fit(method_class))
-        return [self.stars, self.bundle, *paths, *map(self.bundle_of, self.exposures)]
+        return [self.stars, self.bundle, *paths, *map(self.locate_bundle, self.exposures)]
 
 
 @command("train", SettingsReader())
@@ -134,6 +134,12 @@ def train_command(
 
     Parameters
     ----------
+    config : Settings or mapping
+        Settings of the training, from overrides or a file.
+    image : sequence of Path
+        FITS images of one camera, or one FITS cube of stamps.
+    options : ImageOptions
+        Options of the image, and its star list.
     all_extensions : bool
         All images of the file, each by itself and in parallel; OUT gets their names.
     name : str, optional
@@ -150,9 +156,9 @@ def train_command(
     overwrite : bool
         Replace a model that the folder holds.
     snr_min : float, optional
-        Least S/N of a star that is learnt from. [default: 100, less if few]
+        Minimum S/N of training stars. [default: 100, less if few]
     stars_min : int, optional
-        Fewest stars to learn from. [default: 1]
+        Minimum number of training stars. [default: 1]
     stamp_px : int, optional
         Side of the stamps, even. [default: 16, more if stars are larger]
     """
@@ -161,7 +167,7 @@ def train_command(
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
     if stamp_px is not None:
-        # A stated size is used even if stars have light beyond it.
+        # A given size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
     settings = apply_keywords(make_settings(config), Settings.image_groups, size_settings)
     stem, sentence = model_name(image, name), ""
@@ -178,21 +184,21 @@ def train_command(
                 "all_extensions": False,
                 "name": f"{stem}_{extension}",
                 "out": out / extension,
-                "page": path_of_image(page, extension),
+                "page": name_image_path(page, extension),
             }
             for extension, image_options in options_by_image(image[0], options).items()
         }
         run_for_images(train_command, jobs, image[0])
     else:
-        # One image, or exposures that share a model; the same is stated of all.
-        sources = ImageInput(image[0], **vars(options)).of_each(image)
+        # One image, or exposures that share a model; options are the same for all.
+        sources = ImageInput(image[0], **vars(options)).repeat_for(image)
         exposures = [model_name((path,), None) for path in image] if len(image) > 1 else []
         if exposures and method_name is None and "field" in settings.methods:
             # Validation stars would judge the field of all exposures, but each gets its own.
             method_name = "field"
-        settings, methods, candidates = compared_methods(settings, method_name)
+        settings, methods, candidates = select_methods(settings, method_name)
         files = ModelFiles(out, stem, methods, exposures)
-        with reserved_folder(files, sources, page, overwrite):
+        with reserve_folder(files, sources, page, overwrite):
             sentence = write_model(settings, sources, files, licence, candidates, page)
         print(sentence)
     print(f"next: {next_command(image, options, all_extensions, name, out)}")
@@ -208,7 +214,7 @@ def next_command(
 ) -> str:
     """Return the command that applies the model to all stars of the image, or first exposure.
 
-    Parameters are those of `train_command`.
+    Parameters are as for `train_command`.
     """
     # A list for several images has stars of all of them: those off the image are left out.
     several = len(image) > 1
@@ -216,13 +222,13 @@ def next_command(
         options = replace(options, on_image=True)
     stem = model_name(image[:1], None if several else name)
     model = out if several or all_extensions else ModelFiles(out, stem, ()).bundle
-    words = ["psfdae", "predict", str(image[0]), *typed_words(options)]
+    words = ["psfdae", "predict", str(image[0]), *format_as_words(options)]
     words += ["--all-extensions"] * all_extensions
     words += ["--model", str(model), "--out", str(out / f"{stem}_psf.fits")]
     return shlex.join(words)
 
 
-def compared_methods(
+def select_methods(
     settings: Settings, method_name: str | None
 ) -> tuple[Settings, tuple[type[Method], ...], list[type[Method]]]:
     """Choose the methods that are compared, that are fitted, and that may become the model.
@@ -239,7 +245,7 @@ def compared_methods(
     -------
     settings : Settings
         The same with the list of the methods that are compared.
-    fitted : tuple of type of Method
+    storable : tuple of type of Method
         Methods of this list that leave a fit.
     candidates : list of type of Method
         Methods of these that make models.
@@ -251,12 +257,12 @@ def compared_methods(
         names = [n for n in names if method(n).storage is None and n != method_name]
         names.append(method(method_name).name)
     # Some methods with a fit make no models: they are only compared.
-    fitted = tuple(m for m in map(method, names) if m.storage is not None)
-    candidates = [m for m in fitted if makes_models(m.name)]
+    storable = tuple(m for m in map(method, names) if m.storage is not None)
+    candidates = [m for m in storable if makes_models(m.name)]
     if not candidates:
         makers = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
         raise ConfigError(f"methods = {settings.methods}: --method takes one of these: {makers}")
-    return settings.model_copy(update={"methods": names}), fitted, candidates
+    return settings.model_copy(update={"methods": names}), storable, candidates
 
 
 def model_name(image: tuple[Path, ...], name: str | None) -> str:
@@ -279,7 +285,7 @@ def model_name(image: tuple[Path, ...], name: str | None) -> str:
 
 
 @contextmanager
-def reserved_folder(
+def reserve_folder(
     files: ModelFiles, sources: Sequence[ImageInput], page: Path | None, overwrite: bool
 ) -> Iterator[None]:
     """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
@@ -289,7 +295,7 @@ def reserved_folder(
     OutputError, FolderError
         If a path is an input, the folder holds a model, or another process works there.
     """
-    # The model of all images and that of one would have the same file.
+    # The model of all images and the model of one would have the same file.
     if files.name in files.exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
     # No output may be an input, such as the star list of an earlier run.
@@ -301,7 +307,7 @@ def reserved_folder(
     if page is not None and page.exists() and not overwrite:
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     # Models are looked for under the lock, so that no other process writes one meanwhile.
-    with locked_folder(files.path):
+    with lock_folder(files.path):
         bundles = sorted(files.path.glob(f"*{SUFFIX}"))
         if bundles and not overwrite:
             raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
@@ -309,7 +315,7 @@ def reserved_folder(
 
 
 @contextmanager
-def locked_folder(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Refuse a folder in which another process works; the lock ends with the process.
 
     A folder that is left empty is removed again.
@@ -322,7 +328,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
-    # The lock is that of the folder itself, so that no file is left of it.
+    # The folder itself is locked, so that no lock file is left.
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
@@ -331,7 +337,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
             raise FolderError(f"{folder}: another psfdae train works there") from None
         yield
     finally:
-        # A folder with files in it is no empty one, and stays.
+        # A folder with files in it stays.
         os.close(descriptor)
         with suppress(OSError):
             folder.rmdir()
@@ -367,20 +373,20 @@ def write_model(
     # Fit the candidates, and the other methods that the report compares with them. With few
     # stars only one candidate is tried.
     tried_methods = worth_trying(stars, candidates)
-    fitted = fit_methods(
+    all_fits = fit_methods(
         stars, files, [m for m in files.methods if m in tried_methods or m not in candidates]
     )
     # The method with the smallest MSE on validation stars becomes the model.
     model_method = tried_methods[0]
     if len(tried_methods) > 1:
-        best_name, errors = choose_method(stars, {m.name: fitted[m.name] for m in tried_methods})
+        best_name, errors = choose_method(stars, {m.name: all_fits[m.name] for m in tried_methods})
         model_method = method(best_name)
         for name, error in errors.items():
             print(f"{method(name).look.title}: MSE {error:.3g} on validation stars")
     # The fit with all that predictions need: photometry, and errors from stars held out.
     print(f"measuring the errors of the {model_method.look.title} on stars held out")
-    model = pack_model(stars, fitted[model_method.name], files.name, licence)
-    for fact in fitted[model_method.name].facts().values():
+    model = pack_model(stars, all_fits[model_method.name], files.name, licence)
+    for fact in all_fits[model_method.name].facts().values():
         print(f"{model_method.look.title}: {fact}")
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
@@ -391,13 +397,13 @@ def write_model(
         exposure_models = adapt_to_exposures(model, stars)
         for exposure in stars.exposures:
             exposure_model = exposure_models[exposure.name]
-            exposure_model.save(files.bundle_of(exposure.name))
+            exposure_model.save(files.locate_bundle(exposure.name))
             is_adapted = exposure_model is not model
             change = "change the field of all" if is_adapted else "get the model of all"
             print(f"{exposure.name}: {len(exposure)} stars {change}")
         # Stars that no fit has seen, degraded to low S/N, test the model.
         print("testing on the stars held out")
-        report = validate(model, stars, fitted)
+        report = validate(model, stars, all_fits)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.photometry.columns, digits=6)
         write_bytes(files.path / "report.png", report.strip_png)
@@ -411,7 +417,7 @@ def fit_methods(
     stars: ImageStars, files: ModelFiles, methods: Sequence[type[Method]]
 ) -> dict[str, Method]:
     """Fit methods to the training stars, write each fit to its file, and return them by name."""
-    fitted: dict[str, Method] = {}
+    all_fits: dict[str, Method] = {}
     for method_class in methods:
         print(f"fitting the {method_class.look.title}")
         place = files.fit(method_class)
@@ -419,7 +425,7 @@ def fit_methods(
         checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
         fit = fit_method(stars, method_class, checkpoint)
         # The checkpoint goes when the fit is stored; until then, a killed run goes on from it.
-        fits.store(fit, place, described(stars, method_class), stars.product)
+        fits.store(fit, place, describe_settings(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)
-        fitted[method_class.name] = fit
-    return fitted
+        all_fits[method_class.name] = fit
+    return all_fits

@@ -30,6 +30,10 @@ def validate_command(
 
     Parameters
     ----------
+    image : Path
+        FITS image, or FITS cube of stamps.
+    options : ImageOptions
+        Options of the image, and its star list.
     overwrite : bool
         Replace a file that exists.
     model : Path

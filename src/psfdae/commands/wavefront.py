@@ -51,10 +51,14 @@ def wavefront_command(
 
     INPUT is a FITS image with --catalogue or --detect, or a cube of stamps with a catalogue. The
     field angle of a star is in the columns x_deg, y_deg of the list, or follows from its position.
-    Two modes of a star are two wavefronts that its image does not tell apart.
+    Two modes of a star are two wavefronts that its image cannot distinguish.
 
     Parameters
     ----------
+    stars : Path
+        FITS image, or FITS cube of stamps.
+    options : ImageOptions
+        Options of the image, and its star list.
     telescope : Path
         YAML file of the telescope, as in config/telescope.
     stamp_px : int
@@ -96,12 +100,12 @@ def wavefront_command(
             write_png(wavefront_map(wavefronts, f"{source.path.name}: {optics.name}"), plot)
         write_fits(out, wavefront_hdus(wavefronts, source.path.name))
     # Many stars that no wavefront explains mean that the description of the telescope is wrong.
-    count, unexplained = len(wavefronts.stamps), int((~wavefronts.explained).sum())
+    count, failures = len(wavefronts.stamps), int((~wavefronts.explained).sum())
     summary = (
-        f"{out}: {count} stars, {unexplained} not explained ({unexplained / count:.1%}), "
+        f"{out}: {count} stars, {failures} not explained ({failures / count:.1%}), "
         f"χ² {np.nanmedian(wavefronts.chi2):.2f} median"
     )
-    if unexplained > 0.1 * count:
+    if failures > 0.1 * count:
         summary += ": the telescope, its seeing or the prior are not those of the image"
     print("\n".join([*lines, summary]))
 
@@ -109,7 +113,7 @@ def wavefront_command(
 def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     """Return a sentence on how far stars are off the positions of their list, if there is one.
 
-    This is no mistake of the list: aberrations such as coma move the light of a star.
+    This is not a mistake of the list: aberrations such as coma move the light of a star.
 
     Returns
     -------
@@ -125,7 +129,7 @@ def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     centroid = np.stack(
         [(wavefronts.model * index).sum(axis=(1, 2)) / total for index in (columns, rows)]
     )
-    # From pixels of the stamp to those of the image: add the stamp's first pixel.
+    # From pixels of the stamp to pixels of the image: add the stamp's first pixel.
     corner = central_pixel(observation.positions.T) - wavefronts.model.shape[-1] // 2
     offset = centroid + corner - observation.positions.T
     offset = np.where(wavefronts.explained, offset, np.nan).T
@@ -152,7 +156,7 @@ def check_scale(observation: Observation, telescope: OwnTelescope) -> None:
     SensingError
         If they differ by more than `SCALE_TOLERANCE`.
     """
-    # A cube of stamps states no scale: nothing can be compared.
+    # A cube of stamps without a scale cannot be compared.
     scale, telescope_scale = observation.pixel_scale_arcsec, telescope.pixel_scale_arcsec
     # "not <=" refuses a scale that is not a number, too.
     if scale is not None and not abs(scale / telescope_scale - 1.0) <= SCALE_TOLERANCE:
@@ -169,7 +173,7 @@ def field_angles(
     telescope: OwnTelescope,
     axis: tuple[float, float] | None,
 ) -> np.ndarray:
-    """Return the field angles of the stars: listed ones, or those of their pixel positions.
+    """Return the field angles of the stars: listed ones, or computed from their pixel positions.
 
     Parameters
     ----------
@@ -180,7 +184,7 @@ def field_angles(
     telescope : OwnTelescope
         Gives the angle of a pixel.
     axis : tuple of float or None
-        Pixel x, y of the optical axis, by default the middle of the image. If it is stated,
+        Pixel x, y of the optical axis, by default the middle of the image. If it is given,
         angles in the list are not used.
 
     Returns

@@ -60,11 +60,13 @@ class Bundle:
     Attributes
     ----------
     info : BundleInfo
+        Description of the model and of its training.
     weights : dict of str to ndarray
         Arrays of the method, from `Method.pack`.
     flux_model : FluxModel
         Model of the noise-free training stars; `info.components` of its eigenvectors are measured.
     errors : ErrorModel
+        Calibrated errors of the method.
     """
 
     info: BundleInfo
@@ -110,15 +112,15 @@ def estimator(bundle: Bundle) -> Method:
     # The method knows which arrays it can work with: it gives conditions, and denoises a stamp.
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
-        fitted = method_class.from_bundle(bundle.weights, info)
-        for name, expected_shapes, is_fulfilled in fitted.conditions():
+        method_fit = method_class.from_bundle(bundle.weights, info)
+        for name, expected_shapes, is_fulfilled in method_fit.conditions():
             if not np.all(is_fulfilled):
                 raise ValueError(f"array {name!r} must have {expected_shapes}")
-        if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:
+        if method_fit.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:
             raise ValueError("its PSFs have not the size of stamps")
     except (ValueError, TypeError, LookupError, ArithmeticError) as error:
         raise BundleError(f"{info.name}: damaged ({info.method}: {error})") from None
-    return fitted
+    return method_fit
 
 
 # Writing.
@@ -130,7 +132,7 @@ def creation_date() -> str:
     Raises
     ------
     BundleError
-        If SOURCE_DATE_EPOCH is no number of seconds.
+        If SOURCE_DATE_EPOCH is not a number of seconds.
     """
     # https://reproducible-builds.org/specs/source-date-epoch
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
@@ -147,7 +149,9 @@ def write_bundle(bundle: Bundle, path: Path) -> None:
     Parameters
     ----------
     bundle : Bundle
+        Model to write.
     path : Path
+        The file, by custom NAME.psf.safetensors; it is replaced if it exists.
 
     Raises
     ------
@@ -169,6 +173,7 @@ def bundle_bytes(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> bytes:
     Parameters
     ----------
     info : BundleInfo
+        Description of the model.
     arrays : mapping of str to ndarray
         As `bundle_arrays` returns them.
     """
@@ -201,7 +206,7 @@ def bundle_arrays(bundle: Bundle) -> dict[str, np.ndarray]:
     Returns
     -------
     dict of str to ndarray
-        By group and name: `flux/…` (`flux_arrays`), `errors/…`, and those of the method.
+        By group and name: `flux/…` (`flux_arrays`), `errors/…`, and the arrays of the method.
     """
     groups = {
         "flux": flux_arrays(bundle.flux_model, bundle.info.components),
@@ -224,7 +229,7 @@ def locate_shipped_model() -> Path:
 
 
 def name_foreign_format(path: Path) -> str:
-    """Return the name of the format of a file that is no bundle, such as "PSFEx"; else "".
+    """Return the name of the format of a file that is not a bundle, such as "PSFEx"; else "".
 
     Raises
     ------
@@ -305,7 +310,7 @@ def build_bundle(info: BundleInfo, arrays: Mapping[str, np.ndarray]) -> Bundle:
         {k.removeprefix(f"{group}/"): v for k, v in arrays.items() if k.startswith(f"{group}/")}
         for group in ("flux", "errors", info.method)
     )
-    return Bundle(info, weights, build_flux_model(flux), ErrorModel.of_arrays(errors))
+    return Bundle(info, weights, build_flux_model(flux), ErrorModel.from_arrays(errors))
 
 
 def _require(condition: ArrayLike, path: Path, problem: str) -> None:
@@ -320,6 +325,7 @@ def _check(info: BundleInfo, arrays: Mapping[str, np.ndarray], path: Path) -> No
     Parameters
     ----------
     info : BundleInfo
+        Description of the model; it gives method, stamp size and number of components.
     arrays : mapping of str to ndarray
         By group and name, as in the file.
     path : Path

@@ -39,7 +39,7 @@ from psfdae.stars.bright_stars import magnitude
 from psfdae.stars.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
-"""Factor by which a star may be beyond the S/N of the training: its S/N is no better known."""
+"""Tolerance of the S/N range of the training, a factor: the S/N of a star has an error itself."""
 
 MAX_CHI2 = 10.0
 """Largest reduced χ² of a star without the flag POOR_FIT."""
@@ -96,7 +96,7 @@ class CentredStars(NamedTuple):
         filled_stamps = np.where(
             is_unmeasured[:, None, None], np.where(bad, level, stamps), filled_stamps
         )
-        data = np.where(photometry.used & ~bad, stamps, filled_stamps).astype(np.float64) - level
+        data = np.where(photometry.is_used & ~bad, stamps, filled_stamps).astype(np.float64) - level
         # Stamps need as many good pixels as the photometry asks for, and any contrast.
         modulus = np.abs(data).max(axis=(1, 2))
         has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
@@ -116,16 +116,16 @@ class DenoisedStars(NamedTuple):
     Attributes
     ----------
     psf : ndarray, shape (n, d, d)
-        PSFs of flux 1; NaN where there is no flux.
+        PSFs of flux 1; NaN for stars without a flux.
     sigma : ndarray, shape (n, d, d), or None
         Standard deviation of `psf`, if the method knows it.
     photometry : Photometry
         Fluxes and skies by the method where it measures them.
     has_no_flux : ndarray of bool, shape (n,)
     outlier_score : ndarray, shape (n,)
-        How unlike all training stars a star is; NaN where the method has no score.
+        How unlike all training stars a star is; NaN for a method without a score.
     centre : ndarray, shape (n, 2)
-        Centre (row, column) by the method, in the image if the stars are those of one, else in
+        Centre (row, column) by the method, in the image if the stars come from one, else in
         their stamps; NaN unless the method measures stars.
     covariance : ndarray, shape (n, 4, 4)
         Covariance of flux, sky, row and column; NaN unless the method measures stars.
@@ -148,7 +148,7 @@ class DenoisedStars(NamedTuple):
         return DenoisedStars(**values | {"photometry": self.photometry.part(rows)})
 
     def centre_columns(self) -> dict[str, np.ndarray]:
-        """Return the columns on centres, and on errors beside that of the flux.
+        """Return the columns on centres, and on all errors but the flux error.
 
         A number that is known has the error 0, and correlates with nothing.
         """
@@ -242,13 +242,13 @@ class Denoiser(ABC):
         stamps, bad, saturated_pixels = (
             cut(frames, side, shift) for frames in (data, stars.bad, stars.saturated)
         )
-        # Flags of the list, and those of pixels and centring.
+        # Flags of the list, of pixels and of centring.
         flags = stars.flags.copy()
         raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.SATURATED, saturated_pixels.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.OFF_CENTRE, is_too_far)
         bad = bad | saturated_pixels
-        # A sky that is given and is more than 5 σ off that of the border is flagged.
+        # A sky that is given and is more than 5 σ off the sky of the border is flagged.
         border_level = border_median(stamps, bad)
         if np.isfinite(stars.background).any():
             limit = 5.0 * border_scatter(stamps)
@@ -292,12 +292,12 @@ class Denoiser(ABC):
         residual = (centred_stars.stamps - photometry.background[:, None, None]).astype(
             np.float32
         ) - psf
-        # Pixels that were repaired tell nothing.
-        residual[~photometry.used] = np.nan
+        # Pixels that were repaired have no residual.
+        residual[~photometry.is_used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]
         chi2 = compute_reduced_chi2(residual, psf, flux_sigma, photometry.noise, stars.gain)
         flux_error = self._flux_errors(photometry, flux_scale, stars)
-        # Flags beside those of centring, photometry and method. The S/N of a star is known to its
+        # Flags in addition to centring, photometry and method. The S/N of a star is known to its
         # tolerance.
         is_unlike = errors.is_unlike_training(noise, distance, denoised_stars.outlier_score)
         flags |= photometry.flags
@@ -306,7 +306,7 @@ class Denoiser(ABC):
         raise_flag(flags, StarFlag.SNR_HIGH, self.has_snr_max & is_bright)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
-        # One entry for each column; their order is that of `psfdae.image.tables.COLUMNS`.
+        # One entry for each column; their order is as in `psfdae.image.tables.COLUMNS`.
         columns = {
             "id": stars.id,
             "x": stars.x,
@@ -365,20 +365,20 @@ class StampDenoiser(Denoiser):
         noise for larger then: what it does not know of a bright star would pass for flux. Parts are
         denoised together, in which some stars have about the same noise.
         """
-        # Photometry of all parts together, and stars that have none.
+        # Photometry of all parts together, and stars without a flux.
         info = self.bundle.info
-        photometry = Photometry.joined([part.photometry for part in centred_stars])
+        photometry = Photometry.join([part.photometry for part in centred_stars])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
         has_flux = ~has_no_flux
-        # Factors of the fluxes, between 1/2 and 2; more would be no correction. A method is told
-        # the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
+        # Factors of the fluxes, between 1/2 and 2; more would not be a correction. A method is
+        # given the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
         near_clusters: dict[str, Any] = {}
         is_free = has_flux & np.concatenate(
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred_stars]
         )
         if is_free.any() and self.method.finds_flux:
             # √(noise² + floor²): what the method does not know of a star counts as noise.
-            images, noise = self._normalised(photometry, has_no_flux)
+            images, noise = self._normalise(photometry, has_no_flux)
             level = np.hypot(noise, self.bundle.errors.noise_floor) / info.kappa
             factor, near_clusters["near_clusters"] = self._free_flux.flux(images, level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
@@ -387,7 +387,7 @@ class StampDenoiser(Denoiser):
         score = np.full(len(has_flux), np.nan)
         # The PSFs; stars of a catalogue that reaches far beyond the image have all no flux.
         if has_flux.any():
-            images, noise = self._normalised(photometry, has_no_flux)
+            images, noise = self._normalise(photometry, has_no_flux)
             level = noise / info.kappa
             estimate = self.method.estimate(images, level, **near_clusters)
             psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
@@ -406,10 +406,10 @@ class StampDenoiser(Denoiser):
         denoised_stars = DenoisedStars(psf, sigma, photometry, has_no_flux, score, *unknown)
         return [denoised_stars.part(slice(*rows)) for rows in pairwise(ends)]
 
-    def _normalised(
+    def _normalise(
         self, photometry: Photometry, has_no_flux: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return images (n, d, d) of flux 1 and their noise (n,); a mean PSF where is no flux."""
+        """Return images (n, d, d) of flux 1 and their noise (n,); the mean PSF without a flux."""
         # Stars without flux cost as much, and are NaN afterwards; their noise is the largest of the
         # training.
         images = photometry.images
@@ -480,10 +480,11 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     Parameters
     ----------
     centred_stars : CentredStars
+        Stars in the middle of their stamps, with the photometry of the flux model.
     method : Method
         One with the capability `knows_field`.
     errors : ErrorModel
-        Errors of measured stars due to errors of the model, which are added to those of the method.
+        Errors of measured stars due to the PSF model, which are added to the method's errors.
     """
     stars, photometry, border_level = (
         centred_stars.stars,
@@ -494,11 +495,11 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     data, noise, is_unusable = centred_stars.measurable()
     has_flux = np.isfinite(stars.flux)
     # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
-    # that of its flux.
+    # the magnitude of its flux.
     flux = np.where(has_flux, stars.flux, photometry.flux)
     star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
     place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
-    # PSF, flux, sky and centre at once; what is stated is taken as it is. Centres count from the
+    # PSF, flux, sky and centre at once; given values are taken unchanged. Centres count from the
     # middle of the stamp, which was moved.
     estimate = method.measure(
         data,
@@ -510,7 +511,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
         sky=stars.background - border_level,
         gain=stars.gain,
     )
-    # Errors of the method, by noise, and those of its model add up: C = C_noise + C_model.
+    # Errors of the method, by noise, and errors of the PSF model add up: C = C_noise + C_model.
     star_fit = estimate.measurements
     assert star_fit is not None and estimate.sigma is not None
     covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, place[:, :2])
@@ -519,7 +520,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     flux = np.where(has_flux, stars.flux, star_fit.flux)
     is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
     has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
-    # Flags on pixels are those of the photometry, on the flux those of the method.
+    # Flags on pixels come from the photometry, flags on the flux from the method.
     flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
     is_measured = ~has_flux & ~has_no_flux
@@ -542,7 +543,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
     middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
     centre = middle + centred_stars.shift + star_fit.centre
-    # Stars without a flux are told nothing.
+    # Stars without a flux have no result.
     score = estimate.outlier_score
     score = np.full(len(flux), np.nan) if score is None else score.copy()
     for array in (estimate.psf, estimate.sigma, centre, covariance, score):

@@ -17,6 +17,7 @@ def model_facts(bundle: Bundle) -> dict[str, str]:
     Parameters
     ----------
     bundle : Bundle
+        Model to describe.
     """
     info = bundle.info
     # Width of a pixel in arcsec, and in units of λ/D where the telescope is known.
@@ -60,12 +61,13 @@ def error_table(info: BundleInfo) -> Table | None:
     """Return the errors of the test stars as a table of texts, a row for each noise level.
 
     The column "gain" is added: the MSE of the noisy stamps over the MSE of the denoised ones. Below
-    1 the model makes stars worse than they were. A model that has met no test stars, such as a
-    registered one, has no table.
+    1 the model makes stars worse than they were. The result is None for a model
+    that was never tested on stars, such as a registered one.
 
     Parameters
     ----------
     info : BundleInfo
+        Description of the model, with the metrics of its test stars.
     """
     from astropy.table import Table
 

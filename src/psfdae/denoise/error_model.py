@@ -1,13 +1,14 @@
 """Calibrated errors of a fitted method: how far its PSFs, fluxes and centres are off.
 
-In go PSFs of stars with their noise over the flux, and what of noise, flux and sky was stated; out
-come half-widths of intervals that hold 68 and 95 % of the errors. `psfdae.training.calibration`
+Inputs: PSFs of stars with their noise over the flux, and which of noise, flux and sky was given.
+Outputs: half-widths of intervals that hold 68 and 95 % of the errors. `psfdae.training.calibration`
 finds an `ErrorModel` by stars that no training has seen.
 
 Errors of PSFs are per pixel and per noise level. They are not normally distributed: the core of a
 PSF, its wings and the rare star that is unlike all others share a pixel, and the root mean square
-is then wider than the interval that holds 68 % of the errors. Where a method states a σ of every
-pixel, half-widths are in units of it: they correct its σ, which knows the star, by what came true.
+is then wider than the interval that holds 68 % of the errors. Where a method gives a σ of every
+pixel, half-widths are in units of it: they scale this σ, which depends on the star, to the
+measured errors.
 
 These half-widths are for known flux and sky, and for all pixels alike. Where flux or sky are
 estimates, errors are larger, and where a star is bright they are of another distribution: factors
@@ -28,7 +29,7 @@ from psfdae.image.stamps import Stamps
 
 
 class Estimated(IntEnum):
-    """Case of a star: which of its flux and sky were estimated, because they were not stated."""
+    """Case of a star: which of its flux and sky were estimated, because they were not given."""
 
     NOTHING = 0
     FLUX = 1
@@ -65,7 +66,7 @@ class ModelErrors(NamedTuple):
     growth: np.ndarray = np.eye(4)[0]
 
     def flux_factor(self, place: np.ndarray) -> np.ndarray:
-        """Return √v: errors of fluxes at places (n, 2), x and y, over those of the field, (n,).
+        """Return √v: errors of fluxes at (n, 2) positions x, y, over the RMS of the field, (n,).
 
         1 where the place is not known (NaN).
         """
@@ -84,6 +85,7 @@ class ModelErrors(NamedTuple):
         covariance : ndarray, shape (n, 4, 4)
             Covariance of flux, sky, row and column, due to noise.
         flux : ndarray, shape (n,)
+            Fluxes of the stars; negative ones count as 0.
         place : ndarray, shape (n, 2)
             Place x and y in the image; NaN where unknown.
 
@@ -92,7 +94,7 @@ class ModelErrors(NamedTuple):
         ndarray, shape (n, 4, 4)
             A number that is known, whose variance is almost 0, stays so.
         """
-        # Standard errors by the model: those of flux and sky grow with the flux.
+        # Standard errors by the model: errors of flux and sky grow with the flux.
         unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
         model_sigma = np.concatenate([unit * [self.flux, self.sky], zeros + self.centre], axis=1)
         model_sigma *= self.flux_factor(place)[:, None]
@@ -100,7 +102,7 @@ class ModelErrors(NamedTuple):
         variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
         known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)
         model_sigma[np.sqrt(variance) < known_sigma] = 0.0
-        # Both errors are independent, and those of the model in each number are taken to be, too.
+        # Both errors are independent, and the model's errors of each number are taken to be, too.
         return np.asarray(covariance + model_sigma[:, :, None] ** 2 * np.eye(4))
 
 
@@ -119,10 +121,10 @@ class ErrorModel:
     ratio95 : ndarray, shape (S,)
         Factor by which `half_width68` contains 95 % of the errors.
     scale68, scale95 : ndarray, shape (S, 2, 3, 2)
-        Factors by which 68 % and 95 % half-widths are larger. Axes: noise stated or estimated; the
+        Factors by which 68 % and 95 % half-widths are larger. Axes: noise given or estimated; the
         case of `Estimated`; faint or bright pixels (`brightest`).
     flux_scale : ndarray, shape (S,)
-        Scatter of the flux over its stated error, where flux and sky are estimated.
+        Scatter of the flux over its standard error, where flux and sky are estimated.
     distance_limit : float
         99.9 % quantile of the distance of test stars (`mahalanobis`).
     outlier_limit : ndarray, shape (S,), or None
@@ -154,7 +156,7 @@ class ErrorModel:
     @staticmethod
     def shapes(nodes: int, stamp_px: int) -> dict[str, tuple[int, ...]]:
         """Return the shape of every array of errors at S nodes, in stamps of a side, by name."""
-        # Noise stated or estimated; what of flux and sky was estimated; faint or bright pixels.
+        # Noise given or estimated; which of flux and sky was estimated; faint or bright pixels.
         case = (nodes, 2, len(Estimated), 2)
         return {
             "noise": (nodes,),
@@ -170,7 +172,7 @@ class ErrorModel:
         }
 
     @classmethod
-    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> ErrorModel:
         """Return the errors that a file has as arrays, by the names of `shapes`."""
         values: dict[str, Any] = dict(arrays)
         values |= {name: float(arrays[name]) for name in ("distance_limit", "noise_floor")}
@@ -182,7 +184,7 @@ class ErrorModel:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
-        # The reverse of `of_arrays`.
+        # The reverse of `from_arrays`.
         values = {table.name: getattr(self, table.name) for table in fields(self)}
         values["model"] = np.hstack(self.model)
         return {
@@ -194,19 +196,20 @@ class ErrorModel:
     def half_width(
         self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return how wide the errors of PSFs of flux 1 are, and those of their fluxes.
+        """Return the widths of the errors of PSFs of flux 1, and of their fluxes.
 
         All depends on which of noise, flux and sky of a star were estimated.
 
         Parameters
         ----------
         psf : ndarray, shape (n, d, d)
+            Denoised PSFs of flux 1; their brightest pixels have their own factors.
         sigma : ndarray, shape (n, d, d), or None
             Standard deviation of each pixel by the method.
         noise : ndarray, shape (n,)
             Pixel RMS over the flux.
         stars : Stamps
-            Flux, sky and noise as they were stated; NaN where they were estimated.
+            Given flux, sky and noise; NaN where they were estimated.
 
         Returns
         -------
@@ -221,7 +224,7 @@ class ErrorModel:
         half_width = interpolate_at_noise(noise, self.noise, self.half_width68)
         if sigma is not None:
             half_width = half_width * sigma
-        # The half-width of 95 %, as a multiple of that of 68 %.
+        # The half-width of 95 %, as a multiple of the half-width of 68 %.
         ratio95 = np.interp(noise, self.noise, self.ratio95)
         # Factors of the case of each star, for faint and bright pixels, shape (n, 2).
         estimates_noise, estimates_flux, estimates_sky = (
@@ -241,7 +244,7 @@ class ErrorModel:
         scale68, scale95 = interpolate_case(self.scale68), interpolate_case(self.scale95)
         faint_scale, bright_scale = scale68.T.astype(np.float32)[:, :, None, None]
         half_width = half_width * np.where(brightest(psf), bright_scale, faint_scale)
-        # The stated error of a flux is scaled where it was counted: with flux and sky estimated.
+        # The flux error is scaled in the case that was calibrated: flux and sky estimated.
         flux_scale = np.interp(noise, self.noise, self.flux_scale)
         flux_scale = np.where(estimates_flux & estimates_sky, flux_scale, 1.0)
         return half_width, ratio95[:, None] * scale95 / scale68, flux_scale
@@ -270,6 +273,7 @@ def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray)
     nodes : ndarray, shape (S,)
         Noise at which the maps were measured, ascending.
     maps : ndarray, shape (S, d, d)
+        Error of each pixel at the nodes, in any unit.
 
     Returns
     -------
@@ -289,7 +293,7 @@ def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray)
 def brightest(psf: np.ndarray) -> np.ndarray:
     """Return a mask of the brightest pixels of each PSF (n, d, d), 20 of 256 (8 %) of its pixels.
 
-    Errors of these pixels, the core, scale in another way than those of the many faint pixels.
+    Errors of these pixels, the core, scale in another way than errors of the many faint pixels.
     """
     # The threshold is the faintest of the bright pixels; equal pixels count as bright as well.
     flat = psf.reshape(len(psf), -1)
@@ -314,12 +318,14 @@ def mahalanobis(
     noise : ndarray, shape (n,)
         RMS of the sky noise in a pixel over the flux.
     model : FluxModel
+        Mean and eigenvectors of the training stars.
     components : int
         Number of eigenvectors, `BundleInfo.components`.
 
     Returns
     -------
     ndarray, shape (n,), float64
+        Distance D of each star.
     """
     # Scores along the eigenvectors, each over its standard deviation with the star's noise.
     deviations = stamps.reshape(len(stamps), -1) - model.mean

@@ -11,8 +11,8 @@ constant,
     x ~ N(F m + b, S),   S = F²C + σ²I,
 
 with the covariance C of that set as part of the noise. PSFs of the training set sum to 1, hence C
-has no part along a constant: a bright star is measured by its sum, a faint one by a matched filter,
-and all between by the best compromise; and b = mean(x) − F/P.
+has zero variance along a constant: a bright star is measured by its sum, a faint one by a matched
+filter, and all between by the best compromise; and b = mean(x) − F/P.
 
 A dead pixel that reads the sky level looks like another PSF and is not recognised; bad pixels that
 are known should be NaN. No star influences another one.
@@ -31,7 +31,7 @@ from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.stars.moments import SIGMA_OF_MAD
 
 NOISE_FLOOR = 1e-6
-"""Least σ in units of a typical pixel of the star, as images may have no noise."""
+"""Minimum σ in units of a typical pixel of the star, as images may be noise-free."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Photometry:
     images : ndarray, shape (n, d, d)
         Stamps without sky and repaired, zero without flux: as they are by `robust_flux`, of flux 1
         and float32 by `psfdae.denoise.star_flux.Photometer`.
-    used : ndarray of bool, shape (n, d, d)
+    is_used : ndarray of bool, shape (n, d, d)
         Pixels that were measured; the others are repaired.
     flags : ndarray of uint16, shape (n,)
         Sum of the values of `StarFlag`.
@@ -172,7 +172,7 @@ class Photometry:
     background: np.ndarray
     noise: np.ndarray
     images: np.ndarray
-    used: np.ndarray
+    is_used: np.ndarray
     flags: np.ndarray
 
     def part(self, rows: slice) -> Photometry:
@@ -180,7 +180,7 @@ class Photometry:
         return Photometry(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @classmethod
-    def joined(cls, parts: Sequence[Photometry]) -> Photometry:
+    def join(cls, parts: Sequence[Photometry]) -> Photometry:
         """Return the photometry of the stamps of several, one after the other."""
         if len(parts) == 1:
             return parts[0]
@@ -216,8 +216,9 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> Photometry:
     Parameters
     ----------
     images : ndarray, shape (n, d, d)
-        Sky-subtracted stamps in any unit, framed as those of the model.
+        Sky-subtracted stamps in any unit, framed as the model's training stars.
     model : FluxModel
+        Mean, covariance and range of pixels of the training stars.
 
     Raises
     ------
@@ -243,20 +244,20 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> Photometry:
     unit = np.median(modulus, axis=1)
     unit = np.where(unit > 0, unit, modulus.max(axis=1))
     with np.errstate(over="ignore"):
-        scaled = np.clip(x / unit[:, None], -1e15, 1e15)
-    flux, error, sigma, is_used, repaired = _robust_fit(scaled, usable_pixel, model)
-    # Flags: a star has no flux if too few pixels are left, or the flux is below its error.
-    fitted = possible & (is_used.mean(axis=1) >= model.min_good_pixels)
-    usable = fitted & (flux > error)
+        scaled_pixels = np.clip(x / unit[:, None], -1e15, 1e15)
+    flux, error, sigma, is_used, repaired_pixels = _robust_fit(scaled_pixels, usable_pixel, model)
+    # Flags: NO_FLUX if too few pixels are left, or the flux is below its error.
+    is_fitted = possible & (is_used.mean(axis=1) >= model.min_good_pixels)
+    usable = is_fitted & (flux > error)
     flags = np.zeros(len(images), np.uint16)
     raise_flag(flags, StarFlag.MASKED, ~finite.all(axis=1))
     raise_flag(flags, StarFlag.OUTLIER, possible & (is_used < usable_pixel).any(axis=1))
     raise_flag(flags, StarFlag.FAINT, usable & is_faint(flux, error))
     raise_flag(flags, StarFlag.NO_FLUX, ~usable)
-    flux, error, sigma = (np.where(fitted, v * unit, np.nan) for v in (flux, error, sigma))
-    repaired = np.where(fitted[:, None], repaired * unit[:, None], 0.0)
-    used = is_used & fitted[:, None]
-    stamps = (repaired.reshape(images.shape), used.reshape(images.shape))
+    flux, error, sigma = (np.where(is_fitted, v * unit, np.nan) for v in (flux, error, sigma))
+    repaired_pixels = np.where(is_fitted[:, None], repaired_pixels * unit[:, None], 0.0)
+    is_used = is_used & is_fitted[:, None]
+    stamps = (repaired_pixels.reshape(images.shape), is_used.reshape(images.shape))
     return Photometry(flux, error, np.zeros(len(flux)), sigma, *stamps, flags)
 
 
@@ -272,18 +273,21 @@ def _robust_fit(
     finite : ndarray of bool, shape (n, P)
         Pixels that may be used.
     model : FluxModel
+        Mean, covariance and range of pixels of the training stars.
 
     Returns
     -------
     flux, error, sigma : ndarray, shape (n,)
+        Flux, its standard error, and σ of the noise in a pixel, in the unit of x.
     is_used : ndarray of bool, shape (n, P)
-    repaired : ndarray, shape (n, P)
+        Pixels within the range of the training set.
+    repaired_pixels : ndarray, shape (n, P)
         Stamps with the other pixels at their conditional expectation.
     """
 
-    def scatter(modulus: np.ndarray, used: np.ndarray) -> np.ndarray:
+    def scatter(modulus: np.ndarray, is_used: np.ndarray) -> np.ndarray:
         """Return σ (n,) of a normal variable from the median of its modulus in used pixels."""
-        return SIGMA_OF_MAD * np.nanmedian(np.where(used, modulus, np.nan), axis=1)
+        return SIGMA_OF_MAD * np.nanmedian(np.where(is_used, modulus, np.nan), axis=1)
 
     # Start: the flux that minimises Σ|x − F m|, which is the median of x/m with weights m. Bad
     # pixels cannot move it far: together they weigh what the mean PSF has on them.
@@ -304,49 +308,54 @@ def _robust_fit(
         noise = model.clip_sigma * sigma[:, None]
         is_used = finite & (x <= positive * high + noise) & (x >= positive * low - noise)
         # A star without enough pixels is given up; its numbers only have to be defined.
-        used = np.where((is_used.mean(axis=1) >= model.min_good_pixels)[:, None], is_used, finite)
+        in_fit = np.where((is_used.mean(axis=1) >= model.min_good_pixels)[:, None], is_used, finite)
         # F² in S, from the last round, and never below the variance of F by the noise alone.
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
-        flux, error, score, repaired = solve_least_squares(x, used, prior, sigma, model)
+        flux, error, score, repaired_pixels = solve_least_squares(x, in_fit, prior, sigma, model)
         # Scores have a standard deviation of 1 if σ is right.
-        sigma = np.maximum(sigma * np.clip(scatter(score, used), 0.2, 1.5), NOISE_FLOOR)
-    return flux, error, sigma, is_used, repaired
+        sigma = np.maximum(sigma * np.clip(scatter(score, in_fit), 0.2, 1.5), NOISE_FLOOR)
+    return flux, error, sigma, is_used, repaired_pixels
 
 
 def solve_least_squares(
-    x: np.ndarray, used: np.ndarray, prior: np.ndarray, sigma: np.ndarray, model: FluxModel
+    x: np.ndarray, is_used: np.ndarray, prior: np.ndarray, sigma: np.ndarray, model: FluxModel
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Fit the flux with S = prior · C + σ²I over the used pixels of every star.
 
     In the eigenbasis B of C all stars are solved at once; directions without an eigenvector of
     their own share one weight w₀, S⁻¹ = B (w − w₀) Bᵀ + w₀. Unused pixels get the values at which
-    they carry no weight, S⁻¹x = 0 there; sums over all pixels are then those over the used ones.
+    they carry no weight, S⁻¹x = 0 there; sums over all pixels are then sums over the used ones.
 
     Parameters
     ----------
     x : ndarray, shape (n, P)
-    used : ndarray of bool, shape (n, P)
+        Stamps without sky, in units of a typical pixel of each star.
+    is_used : ndarray of bool, shape (n, P)
+        Pixels that are fitted.
     prior, sigma : ndarray, shape (n,)
+        Square of the flux in S, and σ of the noise in a pixel.
     model : FluxModel
+        Mean, covariance and range of pixels of the training stars.
 
     Returns
     -------
     flux, error : ndarray, shape (n,)
+        F and its standard error, in the unit of x.
     score : ndarray, shape (n, P)
         |Leave-one-out residual| in units of its standard deviation.
-    repaired : ndarray, shape (n, P)
+    repaired_pixels : ndarray, shape (n, P)
         Stamps with the unused pixels at their conditional expectation.
     """
     # w₀, w − w₀, and the diagonal of S⁻¹.
     common = 0.0 * sigma if model.is_complete else 1.0 / (prior * model.other_variance + sigma**2)
     weight = 1.0 / (prior[:, None] * model.variance + sigma[:, None] ** 2) - common[:, None]
     precision = weight @ (model.basis**2).T + common[:, None]
-    data = np.where(used, x, 0.0)
-    mean = np.where(used, model.mean, 0.0)
-    # Unused pixels b: x_b = −(S⁻¹_bb)⁻¹ S⁻¹_bu x_u, and the same for m. The diagonal of the inverse
-    # of S over the used pixels is that of S⁻¹ − S⁻¹_ub (S⁻¹_bb)⁻¹ S⁻¹_bu.
-    for star in np.flatnonzero(~used.all(axis=1)):
-        bad = np.flatnonzero(~used[star])
+    data = np.where(is_used, x, 0.0)
+    mean = np.where(is_used, model.mean, 0.0)
+    # Unused pixels b: x_b = −(S⁻¹_bb)⁻¹ S⁻¹_bu x_u, and the same for m. The inverse of S over the
+    # used pixels has the diagonal of S⁻¹ − S⁻¹_ub (S⁻¹_bb)⁻¹ S⁻¹_bu.
+    for star in np.flatnonzero(~is_used.all(axis=1)):
+        bad = np.flatnonzero(~is_used[star])
         if model.is_complete:
             columns = (model.basis * weight[star]) @ model.basis[bad].T
             gain = columns @ np.linalg.inv(columns[bad])
@@ -362,12 +371,12 @@ def solve_least_squares(
             # digits.
             system = common[star] * (1.0 + 1e-12) * identity + excess[:, None] * gram
             solution = np.linalg.solve(system, np.diag(excess))
-            reduced = excess[:, None] * (identity - gram @ solution) / common[star]
-            fill = reduced @ rows.T
+            correction = excess[:, None] * (identity - gram @ solution) / common[star]
+            fill = correction @ rows.T
             data[star, bad] = -(data[star] @ model.basis) @ fill
             mean[star, bad] = -(mean[star] @ model.basis) @ fill
-            # The diagonal of S⁻¹ falls by that of B R G (w − w₀) Bᵀ.
-            loss = (reduced @ gram) * excess
+            # The diagonal of S⁻¹ falls by the diagonal of B R G (w − w₀) Bᵀ.
+            loss = (correction @ gram) * excess
             precision[star] -= ((model.basis @ loss) * model.basis).sum(axis=1)
     # F = mᵀS⁻¹x / mᵀS⁻¹m, and its variance 1 / mᵀS⁻¹m.
     data_modes, mean_modes = data @ model.basis, mean @ model.basis
@@ -377,6 +386,6 @@ def solve_least_squares(
     # S⁻¹(x − F m), whose elements have the variances of the diagonal of S⁻¹.
     residual = ((data_modes - flux[:, None] * mean_modes) * weight) @ model.basis.T
     residual += common[:, None] * (data - flux[:, None] * mean)
-    score = np.abs(residual) / np.sqrt(np.where(used, precision, 1.0))
-    repaired = np.where(used, x, data + flux[:, None] * (model.mean - mean))
-    return flux, 1.0 / np.sqrt(information), score, repaired
+    score = np.abs(residual) / np.sqrt(np.where(is_used, precision, 1.0))
+    repaired_pixels = np.where(is_used, x, data + flux[:, None] * (model.mean - mean))
+    return flux, 1.0 / np.sqrt(information), score, repaired_pixels

@@ -1,7 +1,7 @@
 """Prediction of the stars of an image, for the command `predict` and for `psfdae.PsfModel`.
 
-In go a model, and an image with its star list; out come an observation whose pixels are those of
-the model, and sentences on what limits the trust in the predictions.
+Inputs: a model, and an image with its star list. Outputs: predictions of all stars, an observation
+whose pixels have the model's scale, and sentences on what limits the trust in the predictions.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def predict_stars(
     Parameters
     ----------
     model : StarModel
+        Model with stamps of the size and scale that it was trained on.
     source : ImageInput
-        The image with its list, and what is stated about it.
+        The image with its list and its options.
     threads : int or None
         None takes all cores.
     fixed : bool
@@ -63,13 +64,13 @@ def predict_stars(
 
 
 def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) -> Observation:
-    """Open an image whose pixels must be those of a model.
+    """Open an image whose pixels must have the scale of a model.
 
     Raises
     ------
     PredictionError
         If its pixel scale is another one, or not known; or if listed centres are exact (`fixed`),
-        and there is no list, or the model measures no centres.
+        and the list is missing, or the model does not measure centres.
     """
     observation = open_observation(source, model.info.stamp_px, model.margin_px)
     if model.info.source == "stars":
@@ -114,6 +115,7 @@ def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) ->
     Parameters
     ----------
     stamps : Stamps
+        Stars as they were cut at the listed positions.
     prediction : Prediction
         Predictions of these stamps.
     margin_px : int

@@ -1,6 +1,6 @@
 """Flux, sky and noise of many stars at once, in the space of the leading eigenvectors of PSFs.
 
-The equations are those of `psfdae.denoise.flux_model`: x ~ N(F m + b, S) with S = F²C + σ²I. Here C
+The equations are as in `psfdae.denoise.flux_model`: x ~ N(F m + b, S) with S = F²C + σ²I. Here C
 has the leading eigenvectors E of a training set, with their variances Λ, and one variance for all
 directions beyond them. Then
 
@@ -38,13 +38,14 @@ class LeadingModes:
     Parameters
     ----------
     model : FluxModel
+        Mean and covariance of the training stars.
     components : int
         Number of leading eigenvectors.
     """
 
     def __init__(self, model: FluxModel, components: int) -> None:
         self.pixels = pixels = model.mean.size
-        # At least a quarter of the directions must be left to tell the noise.
+        # At least a quarter of the directions must be left to estimate the noise.
         leading_count = min(components, 3 * pixels // 4)
         leading = model.basis[:, -leading_count:]
         self._variance = model.variance[-leading_count:]
@@ -57,14 +58,14 @@ class LeadingModes:
             else model.other_variance
         )
         self._other_count = pixels - 1 - leading_count
-        # An unknown sky takes the mean of a stamp: what tells the flux is the mean PSF without its
+        # An unknown sky takes the mean of a stamp: the flux is fitted with the mean PSF without its
         # mean, c = m − 1/P. It has the part Eᵀc along E, and |c|² − |Eᵀc|² beyond.
         contrast = model.mean - 1.0 / pixels
         # Double precision: OpenBLAS rounds single precision by the place of a star in its block.
         self._projector = np.column_stack([leading, contrast])
         self._modes = leading.T @ contrast
         self._other_power = max(float(contrast @ contrast - self._modes @ self._modes), 0.0)
-        # The same of the pixels of the border, whose residuals tell the noise.
+        # The same for the pixels of the border, whose residuals give the noise.
         ring = self._ring = border_pixels(round(pixels**0.5))
         self._ring_contrast = contrast[ring]
         self._ring_basis = np.ascontiguousarray(leading[ring].T)
@@ -75,7 +76,7 @@ class LeadingModes:
         sky_known: np.ndarray,
         flux: np.ndarray,
         noise: np.ndarray,
-        used: np.ndarray | None = None,
+        is_used: np.ndarray | None = None,
     ) -> ModesFit:
         """Fit flux and noise of all stars, and the sky where it is not known.
 
@@ -87,8 +88,8 @@ class LeadingModes:
             False for stars of which the sky left over is fitted, too.
         flux, noise : ndarray, shape (n,)
             Known values; they are estimated where they are NaN.
-        used : ndarray of bool, shape (n, P), optional
-            Pixels that tell the noise.
+        is_used : ndarray of bool, shape (n, P), optional
+            Pixels from which the noise is estimated.
         """
         # Without its mean, x has the part `modes` along E and `along` along c; the part of the
         # latter that E does not hold is `outside`, and x² beyond E is `energy`.
@@ -101,12 +102,12 @@ class LeadingModes:
         # A known sky makes the mean of the stamp a measurement of the flux, Σx = F ± σ √P.
         sky_variance = sky_known / self.pixels
 
-        def flux_of(
+        def solve_flux(
             fitted_flux: np.ndarray, sigma2: np.ndarray, other_variance: float
         ) -> tuple[np.ndarray, ...]:
             """Return F = cᵀS⁻¹x / cᵀS⁻¹c, its error, and the weights along E, with S of a flux.
 
-            `other_variance` is Λ₀, that of PSFs along every direction beyond E.
+            `other_variance` is Λ₀, the variance of PSFs along every direction beyond E.
             """
             # F² in S is never below the variance of F by the noise alone, σ²/|m|².
             prior = np.maximum(fitted_flux, 0.0) ** 2 + sigma2 / self._peak
@@ -129,16 +130,16 @@ class LeadingModes:
             sigma2 = np.maximum(residual / self._other_count, NOISE_FLOOR**2)
             sigma2 = np.where(np.isfinite(noise), noise**2, sigma2)
             # What the star has beyond the leading eigenvectors is in σ² here: Λ₀ = 0.
-            fitted_flux, _, weight = flux_of(fitted_flux, sigma2, 0.0)
-        # The noise is that of the border, where the star has little light: the scores there have
-        # the standard deviation 1 if σ is right.
+            fitted_flux, _, weight = solve_flux(fitted_flux, sigma2, 0.0)
+        # The noise is measured in the border, where the star has little light: the scores there
+        # have the standard deviation 1 if σ is right.
         score = self.border_scores(x, modes, total, fitted_flux, weight, sigma2, sky_known)
-        if used is not None:
-            score[~used[:, self._ring]] = np.nan
+        if is_used is not None:
+            score[~is_used[:, self._ring]] = np.nan
         scatter = np.where(np.isfinite(noise), 1.0, compute_clipped_rms(score))
         sigma = np.maximum(np.sqrt(sigma2) * scatter, NOISE_FLOOR)
         # With this noise, what the star has beyond E belongs to its covariance again.
-        fitted_flux, error, _ = flux_of(fitted_flux, sigma**2, self._other_variance)
+        fitted_flux, error, _ = solve_flux(fitted_flux, sigma**2, self._other_variance)
         # b = mean(x) − F/P, since PSFs have the sum 1.
         sky = np.where(sky_known, 0.0, (total - fitted_flux) / self.pixels)
         return ModesFit(fitted_flux, error, sigma, sky)
@@ -167,6 +168,7 @@ class LeadingModes:
         total, flux, sigma2 : ndarray, shape (n,)
             Sum of the stamp before its mean was taken off, F, and σ².
         sky_known : ndarray of bool, shape (n,)
+            True for stars of known sky.
         """
         # S⁻¹(x − Fm) in the border: E (w − 1/σ²) (Eᵀx − F Eᵀc), and what is left of x over σ². A
         # known sky leaves the mean of x − Fm in it.
@@ -175,8 +177,8 @@ class LeadingModes:
         mean = np.where(sky_known, (total - flux) / self.pixels, 0.0)[:, None]
         ring = x[:, self._ring] - flux[:, None] * self._ring_contrast + mean
         residual = ring / sigma2[:, None] + pull @ self._ring_basis
-        # The variance of an element of S⁻¹(x − Fm) is that of the diagonal of S⁻¹; an unknown sky
-        # takes 1/P from it.
+        # Elements of S⁻¹(x − Fm) have the variances on the diagonal of S⁻¹; an unknown sky takes
+        # 1/P from it.
         sky_loss = np.where(sky_known, 0.0, 1.0 / self.pixels)
         precision = excess @ self._ring_basis**2 + ((1.0 - sky_loss) / sigma2)[:, None]
         return np.asarray(residual / np.sqrt(precision))

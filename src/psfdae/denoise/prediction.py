@@ -57,17 +57,17 @@ class Prediction:
           brightest pixels the second one
         - `chi2`: mean of (residual / σ)² over the used pixels, divided by what is expected of it
         - `distance`: from the training set (`psfdae.denoise.error_model.mahalanobis`)
-        - `outlier_score`: −2 ln of the probability density of the star by the model's own law of
-          stars, in its leading components; NaN where it has no law
+        - `outlier_score`: −2 ln of the probability density of the star by the model's own
+          distribution of stars, in its leading components; NaN where the model has none
         - `fwhm_px`, `ellipticity`, `position_angle_deg`: of the PSF (`psfdae.stars.moments`)
         - `x_fit`, `y_fit`: centre of the star, in the image where the star was cut from one, else
-          in its stamp; NaN if the model's method measures none, and so are its errors, that of the
-          sky, and the correlations `corr_*` of two errors each
+          in its stamp; NaN if the model's method measures none, and so are its errors, the sky's
+          error, and the correlations `corr_*` of two errors each
         - `shift_x`, `shift_y`: pixels by which the stamp was moved to centre the star
         - `flags`: sum of `psfdae.StarFlag`s, uint16
     psf : ndarray, shape (n, d, d), float32
         Noise-free image of the star without sky, in the unit of the stamps: the PSF
-        times the flux. NaN where there is no usable flux (flag NO_FLUX).
+        times the flux. NaN without a usable flux (flag NO_FLUX).
     residual : ndarray, shape (n, d, d), float32
         Stamp − sky − `psf`, and − the even light of the star's wings in it; NaN in pixels that
         were not used.
@@ -139,7 +139,7 @@ class Prediction:
         return f"Prediction({len(self)} stars of {side}×{side} px, {clean} without a flag)"
 
     def _repr_html_(self) -> str:
-        """Counts of the stars and of their flags, for a notebook."""
+        """Return the counts of the stars and of their flags, for a notebook."""
         # Flags that no star has are left out.
         side, clean = self.psf.shape[-1], int((self.flags == 0).sum())
         rows = [["stars", str(len(self))], ["stamps", f"{side}×{side} px"]]
@@ -155,7 +155,7 @@ class Prediction:
         It is the table STARS of the file that `psfdae predict` writes; further columns of a star
         list come last (`psfdae.image.tables.star_table`).
         """
-        # FITS has no unsigned integers.
+        # FITS does not have unsigned integers.
         columns = self.columns | {"flags": self.flags.astype(np.int32)}
         return star_table(columns, self.unit, self.list_columns)
 
@@ -205,6 +205,7 @@ class PredictionFile:
     Parameters
     ----------
     file : binary file
+        Open for writing and reading, empty.
     primary : bytes
         Primary header.
     example : Prediction

@@ -1,7 +1,7 @@
 """Arguments of `PsfModel.predict`: arrays that users pass, checked and made to stamps.
 
-Arrays with or without mask, quantities and NDData go in; `Stamps` come out, and the unit that the
-pixels have.
+Inputs: arrays with or without mask, quantities and NDData. Outputs: `Stamps`, and the unit of the
+pixels.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.base.arguments import real_numbers
-from psfdae.image.containers import parts_of_array, sigma_of
+from psfdae.image.containers import compute_sigma, split_array
 from psfdae.image.stamps import Stamps
 from psfdae.psf.interface import PredictionError
 
@@ -32,6 +32,7 @@ def make_stamps(
     Parameters
     ----------
     stamps : array, masked array, Quantity or NDData, shape (n, s, s) or (s, s)
+        Stamps of the stars, or one stamp; pixels of a mask are bad.
     side : int
         The side s that the model takes.
     model_name : str
@@ -50,7 +51,7 @@ def make_stamps(
         If shapes, types or units do not fit.
     """
     # The stamps; a single one has two axes, and counts as a cube of one.
-    values, masked, sigma, unit = _unpack(stamps)
+    values, is_masked, sigma, unit = _unpack(stamps)
     data = real_numbers("stamps", values, PredictionError)
     is_single = data.ndim == 2
     data = data[None] if is_single else data
@@ -98,7 +99,7 @@ def make_stamps(
     x, y, magnitude, colour = _columns("position", position, count, 4).T
     checked_arrays = Stamps(
         data=data if is_finite.all() else np.where(is_finite, data, 0),
-        bad=bad if masked is None else bad | masked,
+        bad=bad if is_masked is None else bad | is_masked,
         saturated=pixel_masks["saturated"],
         flags=np.zeros(count, dtype=np.uint16),
         id=np.arange(count),
@@ -118,7 +119,7 @@ def _unpack(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | No
     if hasattr(stamps, "uncertainty") and hasattr(stamps, "mask"):  # an NDData
         mask = stamps.mask if stamps.mask is None else np.asarray(stamps.mask, dtype=bool)
         unit = "" if stamps.unit is None else str(stamps.unit)
-        return np.asarray(stamps.data), mask, sigma_of(stamps), unit
+        return np.asarray(stamps.data), mask, compute_sigma(stamps), unit
     if hasattr(stamps, "fileinfo"):  # an HDU, or a list of them
         raise PredictionError(
             f"{type(stamps).__name__} in place of stamps: its array is its attribute data; "
@@ -126,13 +127,13 @@ def _unpack(stamps: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | No
         )
     if isinstance(stamps, list | tuple):
         stamps = real_numbers("stamps", stamps, PredictionError)
-    values, mask, unit = parts_of_array(stamps)
+    values, mask, unit = split_array(stamps)
     return values, mask, None, unit
 
 
 def _columns(name: str, values: ArrayLike | None, count: int, max_columns: int) -> np.ndarray:
     """Return two numbers per star, or up to `max_columns` (n, max_columns); NaN where unknown."""
-    # Two columns of NaN where nothing is stated.
+    # Two columns of NaN if the values are not given.
     values = np.full((count, 2), np.nan) if values is None else values
     numbers = real_numbers(name, values, PredictionError)
     if numbers.shape not in [(count, columns) for columns in range(2, max_columns + 1)]:
@@ -140,6 +141,6 @@ def _columns(name: str, values: ArrayLike | None, count: int, max_columns: int) 
             f"{name} of shape {numbers.shape}, expected ({count}, 2)"
             + f" to ({count}, {max_columns})" * (max_columns > 2)
         )
-    # Columns that are not stated are NaN.
+    # Columns that are not given are NaN.
     missing = np.full((count, max_columns - numbers.shape[1]), np.nan)
     return np.hstack([numbers, missing], dtype=np.float64)

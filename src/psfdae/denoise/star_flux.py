@@ -9,7 +9,7 @@ or to the same digits.
 
 The median of the border is only the start for the sky: PSFs with wings have light there, which the
 fit knows of. The noise σ is the scatter of the residuals of the border in units of what the fit
-expects there, so that light of the star in the border is no noise.
+expects there, so that light of the star in the border is not taken for noise.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ class Photometer:
     Parameters
     ----------
     model : FluxModel
+        Mean, covariance and range of pixels of the training stars.
     components : int
         Number of leading eigenvectors that the fit of many stars knows.
     """
@@ -82,14 +83,14 @@ class Photometer:
         has_outlier = (images - reach > self._high).any(axis=1)
         has_outlier |= (images + reach < self._low).any(axis=1)
         images[~has_flux] = 0.0
-        # In the unit of the stamps; what was stated stays.
+        # In the unit of the stamps; given values stay unchanged.
         photometry = Photometry(
             flux=np.where(flux_known, given_stars.flux, fit.flux * scale),
             flux_error=np.where(flux_known, np.nan, fit.error * scale),
             background=np.where(sky_known, sky, sky + fit.sky * scale),
             noise=np.where(np.isfinite(given_stars.noise), given_stars.noise, fit.noise * scale),
             images=images.reshape(stamps.shape),
-            used=np.ones(stamps.shape, dtype=bool),
+            is_used=np.ones(stamps.shape, dtype=bool),
             flags=np.zeros(count, dtype=np.uint16),
         )
         raise_flag(
@@ -149,11 +150,11 @@ class Photometer:
         )
         fitted_flux, fit_flags = estimate.flux[:count], estimate.flags[:count]
         is_fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
-        # A star has no flux if it was not fitted, if the flux is below its error and not given, or
+        # NO_FLUX: the star was not fitted, if the flux is below its error and not given, or
         # if it has no image in single precision. A flux that is given is not faint.
         is_lost = ~is_fitted | ~(flux > self.least_flux * np.abs(filled_pixels).max(axis=1))
         is_lost |= ~has_flux & ((fit_flags & StarFlag.NO_FLUX) > 0)
-        # NO_FLUX is judged with the fluxes that are given; all other flags are those of the fit.
+        # NO_FLUX is judged with the fluxes that are given; all other flags come from the fit.
         flags = fit_flags & ~np.uint16(StarFlag.NO_FLUX)
         flags[has_flux] &= ~np.uint16(StarFlag.FAINT)
         raise_flag(flags, StarFlag.NO_FLUX, is_lost)
@@ -168,19 +169,17 @@ class Photometer:
         known_images = np.tile(self.model.mean.astype(np.float32), (len(estimate.flux), 1))
         known_images[:count] = images
         # These are images of flux 1 without sky, both known here: only the noise is fitted.
-        unit, is_used_pixel = np.ones(len(known_images)), estimate.used.reshape(known_images.shape)
+        unit, is_used = np.ones(len(known_images)), estimate.is_used.reshape(known_images.shape)
         noise = (
-            self.leading.fit(known_images, unit > 0, unit, np.nan * unit, is_used_pixel).noise[
-                :count
-            ]
+            self.leading.fit(known_images, unit > 0, unit, np.nan * unit, is_used).noise[:count]
             * flux
         )
         noise = np.where(is_lost, estimate.noise[:count], noise)
-        # Rows of the photometry; what was stated stays.
+        # Rows of the photometry; given values stay unchanged.
         photometry.flux[group] = flux
         photometry.flux_error[group] = np.where(has_flux, np.nan, estimate.flux_error[:count])
         photometry.background[group] = sky + np.where(is_fitted, residual_sky, 0.0)
         photometry.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
         photometry.images[group] = images.reshape(estimate.images[:count].shape)
-        photometry.used[group] = estimate.used[:count]
+        photometry.is_used[group] = estimate.is_used[:count]
         photometry.flags[group] = flags

@@ -176,7 +176,7 @@ class StarModel(FieldPsfs):
             and `flux_error`.
         position : array, shape (n, 2) to (n, 4), optional
             (x, y) of the stars in the image of the training, 0-based; NaN where unknown. The third
-            number is the magnitude −2.5 log₁₀ (flux / counts), by default that of the flux in the
+            number is the magnitude −2.5 log₁₀ (flux / counts), by default of the flux in the
             stamp, the fourth the colour; they count where the PSF of the training stars changes
             with their brightness and colour.
         centre : array, shape (n, 2), optional
@@ -267,7 +267,7 @@ class StarModel(FieldPsfs):
         """Return the relative flux errors of stars at positions (n, 2), x and y, due to the PSF.
 
         Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
-        middle of the field, they are not below those of the whole field: a map of the sky has
+        middle of the field, they are not below the RMS over the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
         errors = self.bundle.errors.model
@@ -307,6 +307,7 @@ class StarModel(FieldPsfs):
         return field
 
     def residual_variance(self, side_px: int) -> float:
+        """Return the mean variance of stars about the field, in the middle of a PSF of flux 1."""
         if not isinstance(self.method, FieldPrior):
             return np.nan
         # Residuals of stars in the middle of their pixel (eq. 6): squares of modes, and diagonal.
@@ -317,9 +318,11 @@ class StarModel(FieldPsfs):
         return float(variance[middle, middle].mean())
 
     def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+        """Return the PSFs of flux 1 at positions (n, 2 to 4), as `FieldPsfs` defines it."""
         return self._field().psf_at(place, oversampling)
 
     def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
+        """Return the model in the pixel frame of an image, and notes on how frames differ."""
         size = self.image_px
         if not self.method.knows_field or size is None or observation.shape is None:
             return self, []
@@ -351,7 +354,7 @@ class StarModel(FieldPsfs):
         return type(self)(shifted_bundle), [f"{observation.path}: {words}; {place}"]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
-        """Refuse stars whose pixels are not those of the training.
+        """Raise an error if the pixels of stars differ in scale from the training stars.
 
         Parameters
         ----------

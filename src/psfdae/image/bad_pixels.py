@@ -1,7 +1,7 @@
 """Pixels of an image that show no light of the sky: blank areas, overscan, cosmic rays, hot pixels.
 
-In: an image (h, w), in any unit, and its headers. Out: `BadPixels`, masks of pixels that sky,
-detection and fits leave out. Each function below finds one kind of them.
+Inputs: an image (h, w), in any unit, and its headers. Output: `BadPixels`, masks of the pixels that
+sky, detection and fits leave out. Each function below finds one kind of bad pixels.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from psfdae.base.types import Header
-from psfdae.image.interpolation import interpolated
+from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, pixel_noise
 from psfdae.stars.moments import robust_scatter
 
@@ -27,11 +27,11 @@ class BadPixels:
     Attributes
     ----------
     mask : ndarray of bool, shape (h, w)
-        All of them, those that the user or the file masks included.
+        All bad pixels, including the pixels that the user or the file masks.
     cosmic : ndarray of bool, shape (h, w)
         Cosmic rays and hot pixels.
     notes : tuple of str
-        Each kind that there is, with the number of pixels.
+        Each kind of bad pixels in the image, with the number of pixels.
     sky : SkyLevel, optional
         Sky of the image without these pixels, if it was measured to find trails.
     """
@@ -43,19 +43,20 @@ class BadPixels:
 
 
 class ClippedSkyError(ValueError):
-    """The sky of an image was cut off at its least value."""
+    """The sky of an image is clipped at its minimum value."""
 
 
 def find_bad_pixels(
-    image: np.ndarray, masked: np.ndarray, headers: Sequence[Header], saturate: float | None
+    image: np.ndarray, is_masked: np.ndarray, headers: Sequence[Header], saturate: float | None
 ) -> BadPixels:
     """Find all pixels of an image that show no light of the sky, but for trails.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
-    masked : ndarray of bool, shape (h, w)
-        Pixels that are known to be bad; those that are not finite must be among them.
+        Image, in the unit of `saturate`.
+    is_masked : ndarray of bool, shape (h, w)
+        Pixels that are known to be bad, including all pixels that are not finite.
     headers : sequence of Header
         Headers of the image, in which sections of the detector may be given.
     saturate : float, optional
@@ -64,10 +65,10 @@ def find_bad_pixels(
     Raises
     ------
     ClippedSkyError
-        If so many pixels have the least value that sky and noise are not measurable.
+        If so many pixels have the minimum value that sky and noise cannot be measured.
     """
     notes: list[str] = []
-    mask = np.zeros(masked.shape, dtype=bool)
+    mask = np.zeros(is_masked.shape, dtype=bool)
 
     def leave_out(area: np.ndarray, words: str) -> None:
         """Add pixels (h, w) to the mask, with a note of their number if there are any."""
@@ -75,19 +76,19 @@ def find_bad_pixels(
         if area.any():
             notes.append(f"{np.count_nonzero(area)} {words}")
 
-    leave_out(masked, "pixels that are masked or have no value")
+    leave_out(is_masked, "pixels that are masked or have no value")
     # Areas of one value, then the columns and rows that the header calls overscan.
-    for value, area in blank_areas(image, mask, saturate):
+    for value, area in find_blank_areas(image, mask, saturate):
         leave_out(area, f"blank pixels (value {value:g})")
-    for key, area in overscan(headers, image, mask):
+    for key, area in find_overscan(headers, image, mask):
         leave_out(area, f"pixels outside the exposed area by {key}")
     refuse_clipped_sky(image, mask)
-    # Dead pixels first: beside these, others would look like cosmic rays.
+    # Dead pixels first: next to these, others would look like cosmic rays.
     noise = pixel_noise(image, mask)
-    leave_out(dead_pixels(image, mask, noise), "dead pixels")
-    cosmic = cosmic_rays(image, mask, noise, saturate)
+    leave_out(find_dead_pixels(image, mask, noise), "dead pixels")
+    cosmic = find_cosmic_rays(image, mask, noise, saturate)
     leave_out(cosmic, "pixels of cosmic rays and hot pixels")
-    # Without these, what remains below the sky and shows no star received no light.
+    # Of the pixels that remain, an area below the sky without stars did not receive light.
     if (dark := find_dark_area(image, mask)) is not None:
         leave_out(dark[1], f"pixels that are not exposed (level {dark[0]:.4g})")
     return BadPixels(mask, cosmic, tuple(notes))
@@ -99,12 +100,12 @@ def find_in_bands(
     """Return the mask (h, w) that a function finds in bands of 256 rows of maps (h, w).
 
     The function sees 16 rows more on each side. Bands bound the memory for a large image. In an
-    image of fewer than `side_min` rows or columns, a pixel has no surroundings: it finds nothing.
+    image of fewer than `side_min` rows or columns, the surroundings are missing: nothing is found.
 
     Parameters
     ----------
     find : callable
-        Takes some rows of each map, and returns a mask of these rows.
+        Receives some rows of each map, and returns a mask of these rows.
     *maps : ndarray, shape (h, w)
         Arguments of the function.
     side_min : int
@@ -113,7 +114,7 @@ def find_in_bands(
     mask = np.zeros(maps[0].shape, dtype=bool)
     height = len(mask) if min(mask.shape) >= side_min else 0
     for top in range(0, height, 256):
-        # Rows beyond the edges of the band, so that filters of a few pixels see the image there.
+        # Rows outside the band, so that filters of a few pixels see the image there.
         start, end = max(top - 16, 0), min(top + 256, height)
         mask[top:end] = find(*(band[start : end + 16] for band in maps))[top - start : end - start]
     return mask
@@ -122,30 +123,32 @@ def find_in_bands(
 # Blank areas.
 
 
-def blank_areas(
+def find_blank_areas(
     image: np.ndarray, bad: np.ndarray, saturate: float | None = None
 ) -> list[tuple[float, np.ndarray]]:
     """Find areas in which all pixels have exactly one value, such as the border of a mosaic.
 
     A blank area has a square of 8 × 8 pixels, or whole rows or columns. Areas above
     saturation, or above the sky and not at the edge of the image, are cores of saturated stars.
-    Images without noise have no blank areas: there, one value is the sky.
+    An image without noise does not contain blank areas: there, one value is the sky.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Image, in any unit.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     saturate : float, optional
+        Value from which a pixel is saturated, in the unit of the image.
 
     Returns
     -------
     list of (float, ndarray of bool)
         Value and pixels of each kind of area.
     """
-    # Squares and lines in which the least and the greatest value are the same.
+    # Squares and lines in which the minimum and the maximum are the same.
     values = np.where(bad, np.nan, image)
-    solid = find_in_bands(constant_squares, values, side_min=8) & np.isfinite(values)
+    solid = find_in_bands(find_constant_squares, values, side_min=8) & np.isfinite(values)
     # Whole columns and whole rows of one value; NaN is equal to nothing.
     solid |= (values == values[:1]).all(axis=0)
     solid |= (values == values[:, :1]).all(axis=1, keepdims=True)
@@ -161,20 +164,20 @@ def blank_areas(
         # Whole counts of little noise fill a few squares by chance, and much is connected to them.
         if np.count_nonzero(solid & area) < 0.5 * np.count_nonzero(area):
             continue
-        # Of a large image, one pixel of 16 says how far the rest is from the value.
+        # In a large image, one pixel of 16 shows how far the rest is from the value.
         outside = ~area & ~bad
         sample = np.s_[:] if outside.size < 2**22 else np.s_[::4, ::4]
         outside_values = values[sample][outside[sample]]
         if not outside_values.size or (saturate is not None and value >= saturate):
             continue
-        # Above the sky, only what touches the edge of the image: a core of a star does not.
+        # Above the sky, only parts at the edge of the image: a core of a star is not there.
         if value > float(np.median(outside_values)):
             # Parts of the area that touch one of the four edges are kept.
             label, _ = scipy.ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
-        # Beside a blank area, the image is as far from its value as anywhere, and few pixels of
-        # the image touch it. Beside the even sky of an image without noise, there is faint light.
+        # Next to a blank area, the image is as far from its value as anywhere, and few pixels of
+        # the image touch it. Next to the even sky of an image without noise, there is faint light.
         border = scipy.ndimage.binary_dilation(area) & ~area & ~bad
         if not border.any():
             continue
@@ -185,15 +188,15 @@ def blank_areas(
     return areas
 
 
-def constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
-    """Return the pixels (h, w) of squares that have one value; noise fills none of 8 px with one.
+def find_constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
+    """Find the pixels (h, w) of squares that have one value; noise fills none of 8 px with one.
 
     NaN differs from itself.
 
     Parameters
     ----------
     values : ndarray, shape (h, w)
-        Pixels; NaN where they do not count.
+        Pixels; NaN where they are ignored.
     side : int
         Side of the squares in px.
     """
@@ -207,23 +210,26 @@ def constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
 
 
 def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.3) -> None:
-    """Refuse an image of which more than a part of the good pixels have the least value.
+    """Raise an error if more than a part of the good pixels have the minimum value.
 
-    Pixels that lie together, as the even sky of an image without noise does, do not count, nor do
+    Pixels that lie together, as in the even sky of an image without noise, are allowed, and so are
     counts of few photons, where the next value is as frequent.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Image, in any unit.
     bad : ndarray of bool, shape (h, w)
+        Pixels to ignore.
     share_max : float
-        Part from which the sky was clipped.
+        Fraction of the good pixels from which the sky is taken for clipped.
 
     Raises
     ------
     ClippedSkyError
+        If the sky is clipped at its minimum value.
     """
-    # Part of the good pixels that has the least value.
+    # Fraction of the good pixels that has the minimum value.
     good = ~bad
     count = np.count_nonzero(good)
     if not count:
@@ -233,14 +239,14 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.
     share = float(np.count_nonzero(at_least & good) / count)
     if share < share_max:
         return
-    # Neighbours change between least and other values 2p(1 − p) times where noise decides it.
+    # Independent neighbours differ, one at the minimum and one above, with probability 2p(1 − p).
     pairs = ~(bad[:, 1:] | bad[:, :-1])
     changes = np.count_nonzero((at_least[:, 1:] != at_least[:, :-1]) & pairs)
     by_noise = 2.0 * share * (1.0 - share) * np.count_nonzero(pairs)
     higher = good & ~at_least
     if changes < 0.5 * by_noise or not higher.any():
         return
-    # Part of the pixels that has the second value.
+    # Fraction of the pixels that has the second value.
     second = image.min(where=higher, initial=np.inf)
     if np.count_nonzero((image == second) & higher) / count > 0.3 * share:
         return
@@ -254,13 +260,13 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.
 # Overscan.
 
 
-def overscan(
+def find_overscan(
     headers: Sequence[Header], image: np.ndarray, bad: np.ndarray
 ) -> list[tuple[str, np.ndarray]]:
     """Find the rows and columns that the header's sections exclude from the exposed area.
 
-    Headers often keep sections of the frame before it was trimmed. A section counts only if it lies
-    in the image, leaves out at most a quarter of it, and if the pixels outside differ from the
+    Headers often keep sections of the frame before it was trimmed. A section is used only if it
+    lies in the image, leaves out at most a quarter of it, and if the pixels outside differ from the
     others in their level or in their noise.
 
     Returns
@@ -269,24 +275,24 @@ def overscan(
         Key of the header and the pixels (h, w) outside.
     """
     areas = []
-    excluded = bad.copy()
+    is_excluded = bad.copy()
     section_form = re.compile(r"\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]")
     for key in ("TRIMSEC", "DATASEC", "BIASSEC"):
         # [x0:x1,y0:y1], both ends included, from 1.
         section = next((section_form.search(str(h[key])) for h in headers if key in h), None)
         if section is None:
             continue
-        # A section that is not within the image is that of another frame.
+        # A section that is not within the image belongs to another frame.
         x0, x1, y0, y1 = map(int, section.groups())
         if not (1 <= x0 <= x1 <= image.shape[1] and 1 <= y0 <= y1 <= image.shape[0]):
             continue
         # BIASSEC is outside of the exposed area, the others are all of it.
         area = np.full(image.shape, key != "BIASSEC")
         area[y0 - 1 : y1, x0 - 1 : x1] = key == "BIASSEC"
-        area &= ~excluded
+        area &= ~is_excluded
         if not 0 < np.count_nonzero(area) <= 0.25 * image.size:
             continue
-        inside, outside = image[~(excluded | area)], image[area]
+        inside, outside = image[~(is_excluded | area)], image[area]
         if not inside.size:
             continue
         # Overscan has another level than the sky, or less noise.
@@ -294,7 +300,7 @@ def overscan(
         step = abs(float(np.median(outside)) - float(np.median(inside)))
         if step > 3.0 * other_noise or other_noise < 0.8 * noise:
             areas.append((key, area))
-            excluded |= area
+            is_excluded |= area
     return areas
 
 
@@ -307,15 +313,15 @@ def find_dark_area(
     """Find the area outside of the image circle or a field stop, of any shape, and its soft edge.
 
     In squares of `side` pixels, such an area has one level, no stars, and less noise than the
-    sky. The other squares are far above it and have about one level, too: those of stars,
-    galaxies and nebulae on an empty sky do not.
+    sky. The other squares are far above it and have about one level, too, unlike squares with
+    stars, galaxies and nebulae on an empty sky.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
-        In any unit.
+        Image, in any unit.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     side : int
         Side of the squares in px.
 
@@ -324,7 +330,7 @@ def find_dark_area(
     level : float
         Level of the area, in counts.
     area : ndarray of bool, shape (h, w)
-        Its pixels. Instead of the two, None if there is no such area.
+        Pixels of the area. The function returns None instead of the two without such an area.
     """
     # Mean of each square, and σ from the differences of neighbours: σ² = ⟨(x₁ − x₂)²⟩/2.
     rows, columns = (n // side for n in image.shape)
@@ -359,7 +365,7 @@ def find_dark_area(
     half_level = 0.5 * (level + float(np.percentile(mean[is_sky], 10)))
     core = np.zeros(image.shape, dtype=bool)
     core[in_squares] = np.kron(area | is_dark, np.ones((side, side), dtype=bool))
-    smooth = scipy.ndimage.uniform_filter(interpolated(image, bad)[0], 5)
+    smooth = scipy.ndimage.uniform_filter(fill_bad(image, bad)[0], 5)
     core = scipy.ndimage.binary_propagation(core, mask=core | (smooth < half_level))
     # Level at each distance from these, in steps of 2 px. The edge ends where it is straight within
     # half the noise of a pixel over 32 px, as meshes of the sky follow it.
@@ -373,34 +379,34 @@ def find_dark_area(
 # Single pixels.
 
 
-def dead_pixels(
+def find_dead_pixels(
     image: np.ndarray, bad: np.ndarray, noise: np.ndarray, least_sigma: float = 6.0
 ) -> np.ndarray:
-    """Find the pixels (h, w) that are 6 σ below the least of their eight neighbours.
+    """Find the pixels (h, w) that are 6 σ below the faintest of their eight neighbours.
 
     Parameters
     ----------
     image, noise : ndarray, shape (h, w)
-        The noise is that of pixels.
+        Image, and σ of its pixels (`pixel_noise`).
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     least_sigma : float
-        Least depth of a dead pixel, in σ.
+        Minimum depth of a dead pixel, in σ.
 
     Returns
     -------
     ndarray of bool, shape (h, w)
-        All False for an image of less than 32 px, in which a pixel has no surroundings.
+        All False for an image with a side below 32 px, too small to have surroundings.
     """
     around = np.ones((3, 3), dtype=bool)
     around[1, 1] = False
 
     def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        # First against the noise of the square, then against that of the pixels around.
-        clean = interpolated(band, bad)[0]
+        # First against the noise of the square, then against the noise of the pixels around.
+        clean = fill_bad(band, bad)[0]
         depth = scipy.ndimage.minimum_filter(clean, footprint=around) - clean
         row, column = np.nonzero((depth > least_sigma * noise) & ~bad)
-        deep = depth[row, column] > least_sigma * _noise_around(clean, noise, row, column)
+        deep = depth[row, column] > least_sigma * _measure_noise(clean, noise, row, column)
         dead = np.zeros(clean.shape, dtype=bool)
         dead[row[deep], column[deep]] = True
         return dead
@@ -408,60 +414,61 @@ def dead_pixels(
     return find_in_bands(find, image, bad, noise)
 
 
-def cosmic_rays(
+def find_cosmic_rays(
     image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
 ) -> np.ndarray:
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
-    A pixel counts if its Laplacian L⁺ (`edges`) is 6 times the noise, and larger than the fine
-    structure F of the image around it by a factor: 5, or four times what the bright
-    sources of this image have where they are so narrow that it is more. Stars are thus never
+    A pixel is found if its Laplacian L⁺ (`compute_edges`) is 6 times the noise, and larger than the
+    fine structure F of the image around it by a factor: 5, or four times the median L⁺/F of the
+    bright sources of this image where they are so narrow that this is more. Stars are thus never
     taken for cosmic rays, and where they are nearly as narrow as these, only very high ones are
-    found; none are where the median is over 10.
+    found; none are found where the median is over 10.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Image, in any unit.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     noise : ndarray, shape (h, w)
         σ of the pixels (`pixel_noise`).
     saturate : float, optional
-        Around areas of four or more pixels above it, edges are those of saturated stars.
+        Value from which a pixel is saturated; edges around four or more such pixels are ignored.
 
     Returns
     -------
     ndarray of bool, shape (h, w)
     """
     # How sharp the stars of this image are decides how sharp a cosmic ray must be.
-    sharpness = sharpness_of_sources(image, bad, noise, saturate)
+    sharpness = measure_sharpness(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
         return np.zeros(image.shape, dtype=bool)
     ratio = max(5.0, 4.0 * sharpness)
-    find = partial(cosmic_rays_of_band, saturate=saturate, ratio=ratio)
+    find = partial(find_cosmic_rays_in_band, saturate=saturate, ratio=ratio)
     return np.asarray(find_in_bands(find, image, bad, noise) & ~bad)
 
 
-def cosmic_rays_of_band(
+def find_cosmic_rays_in_band(
     band: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None, ratio: float
 ) -> np.ndarray:
-    """Return the cosmic rays of some rows (r, w) that are sharper than stars by a ratio.
+    """Find the cosmic rays of some rows (r, w) that are sharper than stars by a ratio.
 
-    They are 6 times as high as the noise, or half of it beside a higher one.
+    They are 6 times as high as the noise, or half of it next to a higher one.
 
     Parameters
     ----------
     band, noise : ndarray, shape (r, w)
         Rows of the image, and σ of their pixels.
     bad : ndarray of bool, shape (r, w)
-        Pixels that do not count.
+        Pixels to ignore.
     saturate : float or None
         Counts from which a pixel is saturated.
     ratio : float
-        Least L⁺ over fine structure F of a cosmic ray.
+        Minimum L⁺ over fine structure F of a cosmic ray.
     """
-    # No cosmic ray is beside a bad pixel, or at the edge of a saturated star.
-    clean = interpolated(band, bad)[0]
+    # Cosmic rays are not searched for next to a bad pixel, or at the edge of a saturated star.
+    clean = fill_bad(band, bad)[0]
     forbidden = scipy.ndimage.binary_dilation(bad)
     if saturate is not None:
         # Pixels in and around areas of four saturated pixels or more.
@@ -470,46 +477,46 @@ def cosmic_rays_of_band(
         large[0] = False
         forbidden |= scipy.ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
     cosmic = np.zeros(band.shape, dtype=bool)
-    # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
+    # Tracks are found from their ends inwards: found pixels are replaced, and the search repeats.
     for _ in range(8):
         # L⁺ of all pixels; half of the limit on a cosmic ray picks out those that are worth a
         # closer look.
-        edge = edges(clean)
+        edge = compute_edges(clean)
         row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden & ~cosmic)
         if not row.size:
             break
-        sigma = _noise_around(clean, noise, row, column)
-        height, structure = _contrast(clean, edge, row, column)
+        sigma = _measure_noise(clean, noise, row, column)
+        height, structure = _measure_contrast(clean, edge, row, column)
         # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
         limit = np.maximum(6.0 * sigma, ratio * (np.maximum(structure, 0.0) + sigma))
         sharp = height > limit
         new = np.zeros_like(cosmic)
         new[row[sharp], column[sharp]] = True
-        # Beside a cosmic ray, half the height is enough for both.
+        # Next to a cosmic ray, half the height is enough for both.
         is_beside = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
         is_beside &= height > 0.5 * limit
         new[row[is_beside], column[is_beside]] = True
         if not new.any():
             break
         cosmic |= new
-        clean = interpolated(clean, cosmic | bad)[0]
+        clean = fill_bad(clean, cosmic | bad)[0]
     return cosmic
 
 
-def sharpness_of_sources(
+def measure_sharpness(
     image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
 ) -> float:
-    """Return the median of L⁺/F at the brightest pixels of the bright stars; 0 if there are none.
+    """Measure the median of L⁺/F at the brightest pixels of the bright stars; 0 without stars.
 
     It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, 3 to 5 for 1.2 px, and 7 to 15 for
-    0.9 px. Sources above 20 are no stars.
+    0.9 px. Sources above 20 are not stars.
 
     Parameters
     ----------
     image, noise : ndarray, shape (h, w)
         Image, and σ of its pixels.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     saturate : float, optional
         Counts from which a pixel is saturated; such sources are left out.
     """
@@ -519,8 +526,8 @@ def sharpness_of_sources(
     for rows in (slice(top, top + 256) for top in range(0, len(image), 256)):
         # Fill bad pixels first: the Laplacian would see their edges.
         hidden, sigma = bad[rows], noise[rows]
-        clean = interpolated(image[rows], hidden)[0]
-        edge = edges(clean)
+        clean = fill_bad(image[rows], hidden)[0]
+        edge = compute_edges(clean)
         # Local maxima, so bright that noise does not matter, and not saturated.
         above = clean - np.median(clean)
         top = (clean == scipy.ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
@@ -528,72 +535,73 @@ def sharpness_of_sources(
         row, column = np.nonzero(top)
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         row, column = row[brightest], column[brightest]
-        # Ratio L⁺/F of each; F is at least the noise, so that a flat surrounding does not count as
+        # Ratio L⁺/F of each; F is at least the noise, so that flat surroundings are not taken for
         # sharp.
-        height, structure = _contrast(clean, edge, row, column)
+        height, structure = _measure_contrast(clean, edge, row, column)
         ratio = height / np.maximum(structure, sigma[row, column])
         ratios.append(ratio[ratio < 20.0])
     return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
 
 
-def edges(image: np.ndarray) -> np.ndarray:
-    """Return the positive Laplacian L⁺ of an image (h, w) that is subsampled twice, in its unit.
+def compute_edges(image: np.ndarray) -> np.ndarray:
+    """Compute the positive Laplacian L⁺ of an image (h, w) that is subsampled twice, in its unit.
 
     A pixel of height h on an even sky has L⁺ = h. A quarter of a pixel that is repeated twice along
     both axes differs from two neighbours only, one along each axis; L⁺ is the mean of the four
     quarters, each cut off at 0.
     """
-    padded = np.pad(image, 1, mode="edge")
+    wide_image = np.pad(image, 1, mode="edge")
     # 2 x − a − b of the neighbours a above or below and b on the left or right, ≥ 0.
     quarters = [
         np.maximum(2.0 * image - vertical - horizontal, 0.0)
-        for vertical in (padded[:-2, 1:-1], padded[2:, 1:-1])
-        for horizontal in (padded[1:-1, :-2], padded[1:-1, 2:])
+        for vertical in (wide_image[:-2, 1:-1], wide_image[2:, 1:-1])
+        for horizontal in (wide_image[1:-1, :-2], wide_image[1:-1, 2:])
     ]
     return np.asarray(sum(quarters) / 8.0)
 
 
-def _contrast(
+def _measure_contrast(
     image: np.ndarray, edge: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return L⁺ above its surroundings, and the fine structure F, at some pixels (n,).
+    """Measure L⁺ above its surroundings, and the fine structure F, at some pixels (n,).
 
     L⁺ less its median over 5 × 5 pixels is free of smooth sources. F is the median over 3 × 3
-    pixels less that over 7 × 7 of these medians.
+    pixels less the median over 7 × 7 of these medians.
 
     Parameters
     ----------
     image, edge : ndarray, shape (h, w)
-        Image, and its positive Laplacian (`edges`).
+        Image, and its positive Laplacian (`compute_edges`).
     row, column : ndarray of int, shape (n,)
+        Positions of the pixels, from 0.
     """
     # Windows of 5 × 5 px of L⁺ and of 9 × 9 px of the image, 4096 at a time to bound the memory.
     height, structure = np.empty((2, len(row)))
-    wide_edge, padded = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
+    wide_edge, wide_image = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
     fives = np.lib.stride_tricks.sliding_window_view(wide_edge, (5, 5))
-    nines = np.lib.stride_tricks.sliding_window_view(padded, (9, 9))
+    nines = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
     for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
         at = row[part], column[part]
         height[part] = edge[at] - np.median(fives[at].reshape(-1, 25), axis=1)
-        # Medians over 3 × 3 pixels at the 7 × 7 places about the pixel; the one in the middle is
-        # its own.
+        # Medians over 3 × 3 pixels at the 7 × 7 positions about the pixel; the one in the middle
+        # is its own.
         threes = np.lib.stride_tricks.sliding_window_view(nines[at], (3, 3), axis=(1, 2))
         medians = np.median(threes.reshape(-1, 7, 7, 9), axis=3)
         structure[part] = medians[:, 3, 3] - np.median(medians.reshape(-1, 49), axis=1)
     return height, structure
 
 
-def _noise_around(
+def _measure_noise(
     image: np.ndarray, noise: np.ndarray, row: np.ndarray, column: np.ndarray
 ) -> np.ndarray:
-    """Return the noise about some pixels (n,), at least that of their square.
+    """Measure the noise about some pixels (n,), at least the noise of their square.
 
     In the light of a bright star the noise is larger than in the sky.
     """
     # Median |x₁ − x₂| of the neighbours in 9 × 9 px, over √2.
     scatter = np.empty(len(row))
-    padded = np.pad(image, 4, mode="edge")
-    nines = np.lib.stride_tricks.sliding_window_view(padded, (9, 9))
+    wide_image = np.pad(image, 4, mode="edge")
+    nines = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
     for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
         difference = np.abs(np.diff(nines[row[part], column[part]], axis=2)).reshape(-1, 72)
         scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)

@@ -1,7 +1,7 @@
-"""Camera of an image: its pixel scale, gain, read noise and saturation, and who says so.
+"""Camera of an image: its pixel scale, gain, read noise and saturation, each with its origin.
 
-A header and what the user states go in. Each value comes out with its origin, after a comparison
-with the pixels: of the header's values, those that cannot be right are left out.
+Inputs: a header and the values that the user gives. Output: each value with its origin, after a
+comparison with the pixels; values of the header that cannot be right are left out.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ HEADER_UNITS = dict(zip(HEADER_KEYS, ("arcsec", "electron/adu", "electron", "adu
 class CameraValue(NamedTuple):
     """Number and its origin: "given", "WCS" or a key of the header.
 
-    The number is None where it is not known; then the origin says why.
+    The number is None where it is not known; then the origin gives the reason.
     """
 
     value: float | None
@@ -67,14 +67,14 @@ class SkySample:
     ----------
     level, noise : float
         Median over the squares of their median and of their scatter, σ by the median deviation
-        and, where pixels share their noise, that of sums of pixels.
+        and, where pixels share their noise, the scatter of sums of pixels.
     highest : float
         Largest pixel of all squares.
     correlation : float
-        Noise of sums of pixels over that of independent pixels, at least 1.
+        Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
     checker : float
         Level of the pixels of even rows and columns and of odd ones, less the level of the others,
-        in units of the noise: that of the squares of a chessboard.
+        in units of the noise: the contrast of a chessboard.
     """
 
     level: float
@@ -91,28 +91,28 @@ ONE_COLOUR = (
 """Problem of an undebayered frame, and advice."""
 
 
-def camera_values(image: ImageFile, stated: Mapping[str, float | None]) -> dict[str, CameraValue]:
+def camera_values(image: ImageFile, options: Mapping[str, float | None]) -> dict[str, CameraValue]:
     """Return pixel scale, gain, read noise and saturation, each with its origin.
 
     Parameters
     ----------
     image : ImageFile
-    stated : mapping
-        Values by the names of `HEADER_KEYS`. They go before those of WCS and header; None is not
-        stated.
+        Image with its headers and WCS.
+    options : mapping
+        Values by the names of `HEADER_KEYS`, which override WCS and header; None is not given.
     """
     values = {
-        "pixel scale": pixel_scale(image),
-        "gain": electrons_per_count(image),
-        "read noise": header_number(image, "read noise"),
-        "saturation": header_number(image, "saturation"),
+        "pixel scale": find_pixel_scale(image),
+        "gain": find_gain(image),
+        "read noise": find_number(image, "read noise"),
+        "saturation": find_number(image, "saturation"),
     }
-    values |= {name: CameraValue(v, "given") for name, v in stated.items() if v is not None}
+    values |= {name: CameraValue(v, "given") for name, v in options.items() if v is not None}
     return values
 
 
-def header_number(image: ImageFile, name: str) -> CameraValue:
-    """Return the first finite number above 0 under one of the keys of a value of the camera.
+def find_number(image: ImageFile, name: str) -> CameraValue:
+    """Find the first finite number above 0 under one of the keys of a value of the camera.
 
     Parameters
     ----------
@@ -124,9 +124,9 @@ def header_number(image: ImageFile, name: str) -> CameraValue:
     Returns
     -------
     CameraValue
-        With the key as origin; the number is None if no header has one.
+        Number with the key as origin; None if it is not in any header.
     """
-    # Its own header goes before that of the file; a truth value is no number.
+    # Its own header overrides the file's; a truth value is not a number.
     for key in HEADER_KEYS[name]:
         for header in image.headers:
             number = parse_number(card_value(header, key), HEADER_UNITS[name])
@@ -146,13 +146,13 @@ def unread_card_remarks(image: ImageFile) -> list[str]:
     ]
 
 
-def pixel_scale(image: ImageFile) -> CameraValue:
-    """Return arcseconds per pixel by the WCS, or by other cards of the header.
+def find_pixel_scale(image: ImageFile) -> CameraValue:
+    """Find arcseconds per pixel by the WCS, or by other cards of the header.
 
     Returns
     -------
     CameraValue
-        That of the WCS if there is one, else of a key for the scale, else from the width of a
+        From the WCS if there is one, else from a key for the scale, else from the width of a
         pixel and the focal length.
     """
     from astropy.wcs.utils import proj_plane_pixel_area
@@ -162,9 +162,9 @@ def pixel_scale(image: ImageFile) -> CameraValue:
         with reading(image.path):
             scale = float(np.sqrt(proj_plane_pixel_area(image.wcs))) * 3600.0
         if math.isfinite(scale) and scale > 0:
-            # A WCS in degrees has no more digits.
+            # A WCS in degrees does not have more digits.
             return CameraValue(float(f"{scale:.9g}"), "WCS")
-    header_scale = header_number(image, "pixel scale")
+    header_scale = find_number(image, "pixel scale")
     # Amateurs' cameras have the width of a pixel in micrometres, and the focal length in
     # millimetres: angle = width / focal length.
     width_um, focus_mm = (
@@ -177,11 +177,11 @@ def pixel_scale(image: ImageFile) -> CameraValue:
     return header_scale
 
 
-def electrons_per_count(image: ImageFile) -> CameraValue:
-    """Return electrons per count of the pixels.
+def find_gain(image: ImageFile) -> CameraValue:
+    """Find electrons per count of the pixels.
 
     Images in electrons have 1 whatever the camera's gain was. Of images of a rate, that is, counts
-    per second, or of a calibrated brightness, the gain of the camera is not that of the pixels.
+    per second, or of a calibrated brightness, the gain of the camera does not apply to the pixels.
     """
     # By the unit of the pixels: electrons and photons, counts, a rate of these, or another one.
     unit = parse_unit(image.unit)
@@ -193,7 +193,7 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     is_not_counts = unit is None and re.search("/|jy|erg|mag", image.unit, re.IGNORECASE)
     if is_not_counts or powers not in ({}, {"adu": 1.0}):
         return CameraValue(None, f"not known, the image is in {image.unit}")
-    gain = header_number(image, "gain")
+    gain = find_number(image, "gain")
     if gain.origin == "GAIN":
         # A whole number from 20 on without a unit is a setting, as of amateurs' cameras.
         header = next(h for h in image.headers if card_value(h, "GAIN") is not None)
@@ -204,14 +204,15 @@ def electrons_per_count(image: ImageFile) -> CameraValue:
     return gain
 
 
-def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
+def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
 
-    Squares of one value, such as an area without data, do not count.
+    Squares of one value, such as an area without data, are ignored.
 
     Parameters
     ----------
     image : ImageFile
+        Image (h, w) whose pixels are read.
     square_px : int
         Side of the squares in which sky and noise are measured.
     """
@@ -228,7 +229,7 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
             band = pixels[start : start + square_px]
             band = np.where(np.isfinite(band), band, np.nan)
             highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
-            # Medians of whole counts are those of the counts before rounding.
+            # Medians of whole counts become the medians of the counts before rounding.
             band, dither_variance = dither(band, count_step(band))
             for column in range(0, columns, square_px):
                 square = band[:, column : column + square_px]
@@ -244,7 +245,8 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
                     noises.append(noise)
     if not levels:
         return None
-    # Bands begin at even rows. Stars count as 3 σ; medians would be the same for most whole counts.
+    # Bands begin at even rows. Stars are clipped at 3 σ; medians would be equal for most whole
+    # counts.
     bands = deviations.reshape(-1, columns)
     is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
     white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
@@ -255,16 +257,17 @@ def sky_sample(image: ImageFile, square_px: int = 32) -> SkySample | None:
     return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
 
 
-def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
-    """Return the largest value of an image, and its pixels, if the image was cut off there.
+def find_clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
+    """Find the largest value of an image, and its pixels, if the image is clipped there.
 
-    Noise gives no five pixels far above the sky exactly the same value; those of saturated stars
-    lie together, and those of a value for bad pixels do not. A value that over a hundredth of the
-    image has is that of an area without data.
+    Noise does not give five pixels far above the sky exactly the same value. Pixels of saturated
+    stars lie together, and bad pixels of one value do not. A value that over a hundredth of the
+    image has belongs to an area without data.
 
     Parameters
     ----------
     image : ImageFile
+        Image (h, w) whose pixels are read.
     sky : SkySample
         Sky of the image: the largest value is at least 50 σ above it.
 
@@ -289,40 +292,40 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
             pairs += int(np.count_nonzero(full[1:] & full[:-1]))
     # Few pixels, most of them in pairs, far above the sky.
     suits_stars = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
-    clipped = suits_stars and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
-    return (largest, count) if clipped else None
+    is_clipped = suits_stars and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
+    return (largest, count) if is_clipped else None
 
 
-def checked_camera(
+def check_camera(
     image: ImageFile, camera: Mapping[str, CameraValue]
 ) -> tuple[dict[str, CameraValue], list[str], float]:
-    """Leave out header values that the pixels contradict; those that are given stay, with a word.
+    """Leave out header values that the pixels contradict; given values stay, with a warning.
 
     Parameters
     ----------
     image : ImageFile
-        An image, no cube of stamps.
+        An image, not a cube of stamps.
     camera : mapping
         Values by the names of `HEADER_KEYS`.
 
     Returns
     -------
     values : dict of str to CameraValue
-        Those that fit the pixels.
+        Values that fit the pixels.
     remarks : list of str
-        A sentence on each that does not, on colours, and on noise that pixels share.
+        A sentence on each value that does not, on colours, and on noise that pixels share.
     correlation : float
         Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
 
     Raises
     ------
     ObservationError
-        If a saturation that is given is below the sky.
+        If a given saturation is below the sky.
     """
-    sky, values = sky_sample(image), dict(camera)
+    sky, values = sample_sky(image), dict(camera)
     if sky is None:
         return values, [], 1.0
-    values["saturation"], remarks = checked_saturation(image, sky, camera["saturation"])
+    values["saturation"], remarks = check_saturation(image, sky, camera["saturation"])
     # Noise makes less than 0.1 in 100 × 100 pixels; readout changes levels along rows or columns.
     if abs(sky.checker) > 0.3:
         remarks.append(
@@ -336,8 +339,8 @@ def checked_camera(
             f"{image.path}: pixels share their noise: the noise of their sums is "
             f"{sky.correlation:.2f} times as large as of independent pixels, and errors include it"
         )
-    # A gain of the header that cannot be right is not used, one that is stated is.
-    problem = gain_contradiction(image, sky, camera["gain"], camera["read noise"])
+    # A gain of the header that cannot be right is not used; a given one is.
+    problem = check_gain(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
         return values, remarks, sky.correlation
     origin = camera["gain"].origin
@@ -349,31 +352,33 @@ def checked_camera(
         "subtracted?): not used, errors come from the pixels; "
         f"{keyword('gain')} states another one"
     )
-    # A scale on which the gain is none cannot have the saturation of the camera, either.
+    # On a scale on which the gain does not apply, the saturation of the camera does not, either.
     level, origin = values["saturation"]
     if level is not None and origin != "given" and sky.highest <= 1.0 < level:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
     return values, remarks, sky.correlation
 
 
-def checked_saturation(
+def check_saturation(
     image: ImageFile, sky: SkySample, saturation: CameraValue
 ) -> tuple[CameraValue, list[str]]:
-    """Return the saturation that fits the pixels, and sentences on another one.
+    """Return the saturation that fits the pixels, and sentences on a value that does not.
 
-    It is the largest value, if the image was cut off there, below the level of the header.
+    It is the largest value, if the image is clipped there, below the level of the header.
 
     Parameters
     ----------
     image : ImageFile
+        Image (h, w) whose pixels are read.
     sky : SkySample
+        Sky of the image.
     saturation : CameraValue
-        Counts from which a pixel is saturated, by the header or as stated.
+        Counts from which a pixel is saturated, from the header or given.
 
     Raises
     ------
     ObservationError
-        If a saturation that is stated is below the sky.
+        If a given saturation is below the sky.
     """
     unit, (level, origin) = image.unit or "counts", saturation
     remarks = []
@@ -381,33 +386,35 @@ def checked_saturation(
     if level is not None and level <= sky.level:
         problem = f"saturation at {level:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
         if origin == "given":
-            problem += f"; {keyword('saturate')} takes that of a pixel"
+            problem += f"; {keyword('saturate')} takes the saturation of a pixel"
             raise ObservationError(image.path, problem)
         saturation = CameraValue(None, f"not known, {origin} is below the sky")
         advice = f"not used, {keyword('saturate')} states another one"
         remarks.append(f"{image.path}: {problem}: {advice}")
     # A pile-up of the largest value below the level of the header shows a lower saturation.
-    clipped = None if origin == "given" else clipped_level(image, sky)
-    if clipped is not None and (saturation.value is None or clipped[0] < saturation.value):
-        saturation = CameraValue(clipped[0], "the largest value")
+    pile_up = None if origin == "given" else find_clipped_level(image, sky)
+    if pile_up is not None and (saturation.value is None or pile_up[0] < saturation.value):
+        saturation = CameraValue(pile_up[0], "the largest value")
         remarks.append(
-            f"{image.path}: {clipped[1]} pixels have exactly the largest value, {clipped[0]:g} "
+            f"{image.path}: {pile_up[1]} pixels have exactly the largest value, {pile_up[0]:g} "
             f"{unit}: taken as saturated, {keyword('saturate')} states another level"
         )
     return saturation, remarks
 
 
-def gain_contradiction(
+def check_gain(
     image: ImageFile, sky: SkySample, gain: CameraValue, read_noise: CameraValue
 ) -> str | None:
-    """Return how gain and read noise contradict the pixels; None if they do not.
+    """Check gain and read noise; return how they contradict the pixels, None if they do not.
 
     Photons of the sky alone scatter by √(sky / gain), and the electronics by read noise / gain.
 
     Parameters
     ----------
     image : ImageFile
+        Image, for its unit.
     sky : SkySample
+        Sky of the image, with the noise of its pixels.
     gain, read_noise : CameraValue
         Electrons per count, and electrons.
     """
@@ -434,7 +441,7 @@ def gain_contradiction(
 
 
 def sky_coordinate_remarks(image: ImageFile) -> list[str]:
-    """Return sentences on a WCS that is damaged, or that says two things of its distortion.
+    """Return sentences on a WCS that is damaged, or whose keys contradict each other on distortion.
 
     A WCS is damaged if its keys announce coordinates of the sky, but astropy makes none of them.
     """
@@ -447,8 +454,8 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
             "other keys"
         ]
     # astropy applies a polynomial that the projection does not announce.
-    distorted = image.wcs is not None and image.wcs.sip is not None
-    if distorted and not projection.endswith("-SIP"):
+    has_polynomial = image.wcs is not None and image.wcs.sip is not None
+    if has_polynomial and not projection.endswith("-SIP"):
         return [
             f"{image.path}: CTYPE1 = {projection} has no -SIP, but there is a polynomial of "
             "distortion (A_ORDER): it is used; remove its keys if the image was resampled without "
@@ -458,7 +465,7 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
 
 
 def refuse_colours(image: ImageFile) -> None:
-    """Refuse a frame of a colour camera, debayered or not: a PSF belongs to one colour.
+    """Raise an error for a frame of a colour camera, debayered or not: a PSF belongs to one colour.
 
     Raises
     ------
@@ -468,8 +475,8 @@ def refuse_colours(image: ImageFile) -> None:
     """
     shape = image.shape
     if len(shape) == 3:
-        # A few large planes are no stamps of stars, whose side is at most 256 px.
-        # Colours are the first axis of most programs, and the last one of those that write
+        # A few large planes are not stamps of stars, whose side is at most 256 px.
+        # Colours are the first axis of most programs, and the last one of programs that write
         # pictures.
         first, last = shape[0] in (3, 4), shape[-1] in (3, 4)
         if last or (first and max(shape[1:]) > LARGEST_STAMP_PX):

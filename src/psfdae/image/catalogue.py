@@ -1,8 +1,8 @@
 """Star catalogues: positions, identifiers, fluxes and flags of the stars of a list.
 
-In: a file (`list_formats`), a table of astropy or pandas, sky coordinates or positions. Out:
-`Catalogue`, of which each method returns one value for each star. Names of columns count
-whatever their case; which of them are positions is in `position_columns`.
+Inputs: a file (`list_formats`), a table of astropy or pandas, sky coordinates or positions. Output:
+`Catalogue`, of which each method returns one value for each star. The case of column names does not
+matter; `position_columns` chooses the columns of positions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.types import Column, DataFrame, SkyCoord, Table
-from psfdae.image.containers import parts_of_array
+from psfdae.image.containers import split_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.list_formats import read_list_table
 from psfdae.image.position_columns import (
@@ -46,12 +46,12 @@ StarList: TypeAlias = (
 
 @dataclass(frozen=True)
 class Catalogue:
-    """A table of stars; rows keep their order, none is left out.
+    """A table of stars; rows keep their order, and all are kept.
 
     Attributes
     ----------
     path : Path
-        File of the list, or what messages call a list in memory.
+        File of the list, or the name of a list in memory in messages.
     table : Table
         All columns, as astropy reads them.
     """
@@ -63,18 +63,19 @@ class Catalogue:
         return len(self.table)
 
     def numbers(self, name: str, strict: bool = True) -> np.ndarray:
-        """Return a column as float64, shape (n,); NaN where the catalogue has no value.
+        """Return a column as float64, shape (n,); NaN where a value is missing.
 
         Parameters
         ----------
         name : str
+            Name of the column; case is ignored unless a column is written exactly so.
         strict : bool
-            Refuse a text that is no number; else it is NaN, unless it has a decimal comma.
+            Reject a text that is not a number; else it is NaN, unless it has a decimal comma.
 
         Raises
         ------
         ObservationError
-            If there is no such column, or it does not hold one number for each star.
+            If the column does not exist, or does not hold one number for each star.
         """
         # One value for each star.
         column = self._column(name)
@@ -105,20 +106,20 @@ class Catalogue:
         Raises
         ------
         ObservationError
-            If there is no such column, or none of its values is a finite number.
+            If the column does not exist, or does not contain a finite number.
         """
         numbers = self.numbers(name, strict=False)
-        # Infinite numbers are as good as none.
+        # Infinite numbers are missing values.
         finite = np.isfinite(numbers)
         if not finite.any():
             raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
         return np.where(finite, numbers, np.nan)
 
     def pixels(self, name: str) -> np.ndarray:
-        """Return a column of pixel positions, as `coordinates`; units but pixels are refused."""
+        """Return a column of pixel positions, as `coordinates`; rejects other units than pixels."""
         from astropy import units
 
-        # No unit is as good as pixels.
+        # A column without a unit is in pixels.
         unit = getattr(self._column(name), "unit", None)
         pixel_unit = units.Unit(unit or "", parse_strict="silent")
         # A unit that astropy does not know may be a word for pixels.
@@ -130,13 +131,13 @@ class Catalogue:
         return self.coordinates(name)
 
     def positions(self) -> Positions:
-        """Return the columns with the positions, or an error that lists what is accepted."""
+        """Return the columns with the positions; an error lists the names that are accepted."""
         try:
             return choose_positions(self.table.colnames)
         except ColumnError as error:
-            accepted = " ".join(f"{p.first},{p.second}" for pairs in CONVENTIONS for p in pairs)
+            choices = " ".join(f"{p.first},{p.second}" for pairs in CONVENTIONS for p in pairs)
             raise ObservationError(
-                self.path, f"{error}; found {shorten(self.table.colnames)}; accepted {accepted}"
+                self.path, f"{error}; found {shorten(self.table.colnames)}; accepted {choices}"
             ) from None
 
     def sky(self, positions: Positions) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +145,8 @@ class Catalogue:
 
         Columns without unit are in degrees; text with colons, blanks or letters is
         sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
-        off the sphere are NaN, and an error if all are. LSST's `coord_ra` and `coord_dec` without
-        a unit are in radians if all may be.
+        off the sphere are NaN, and an error is raised if all are. LSST's `coord_ra` and `coord_dec`
+        without a unit are in radians if all may be.
         """
         ra = self._angles(positions.first, "hourangle")
         dec = self._angles(positions.second, "deg")
@@ -153,7 +154,7 @@ class Catalogue:
         has_unit = getattr(self._column(positions.first), "unit", None) is not None
         if positions.first.lower() == "coord_ra" and not has_unit and np.nanmax(ra) < 2 * np.pi:
             ra, dec = np.rad2deg(ra), np.rad2deg(dec)
-        # Angles beyond a pole are no place on the sky.
+        # Declinations beyond a pole are not positions on the sky.
         on_sphere = np.abs(dec) <= 90
         if not on_sphere.any():
             row = np.flatnonzero(np.isfinite(dec))[0]
@@ -164,7 +165,7 @@ class Catalogue:
         return ra, np.where(on_sphere, dec, np.nan)
 
     def _angles(self, name: str, sexagesimal_unit: str) -> np.ndarray:
-        """Return a column of angles in degrees, shape (n,), NaN where there is none.
+        """Return a column of angles in degrees, shape (n,), NaN where a value is missing.
 
         Parameters
         ----------
@@ -181,7 +182,7 @@ class Catalogue:
         is_text = column.dtype.kind in "SUO"
         texts = _texts(column) if is_text and column.ndim == 1 else []
         if any(re.search(r"[:hd\s]", text, re.IGNORECASE) for text in texts):
-            # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
+            # A right ascension of 150:00:12 cannot be in hours, nor can the others of the column.
             whole_parts = filter(None, map(re.compile(r"\d+").match, texts))
             if max((float(number[0]) for number in whole_parts), default=0) > 24:
                 sexagesimal_unit = "deg"
@@ -204,12 +205,12 @@ class Catalogue:
             ) from None
 
     def flags(self, positions: Positions) -> np.ndarray:
-        """Return what the program that made the list flags of its stars, as `StarFlag`s.
+        """Return the flags of the program that made the list, as `StarFlag`s.
 
         Parameters
         ----------
         positions : Positions
-            Columns of the positions, whose names tell the program and its column of flags.
+            Columns of the positions, whose names identify the program and its column of flags.
 
         Returns
         -------
@@ -219,7 +220,7 @@ class Catalogue:
         flags = np.zeros(len(self), dtype=np.uint16)
         if positions.flags is not None and positions.flags in self.table.colnames:
             values = np.nan_to_num(self.numbers(positions.flags), posinf=0, neginf=0)
-            # SExtractor's bits against a star; its bit 1, a neighbour nearby, is no reason.
+            # SExtractor's bits against a star; its bit 1, a neighbour nearby, is not a fault.
             bits = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
             for bit, flag in bits.items():
                 raise_flag(flags, flag, (values.astype(np.int64) & bit) > 0)
@@ -256,21 +257,22 @@ class Catalogue:
     def columns(self, rows: np.ndarray) -> Table:
         """Return some rows of all columns of numbers and text but identifiers and pixel positions.
 
-        Columns of arrays, such as images of the stars, are left out, and so is what comes after
-        900 columns, as a FITS table has 999 at most.
+        Columns of arrays, such as images of the stars, are left out, and so are all columns after
+        the first 900, as a FITS table has 999 at most.
 
         Parameters
         ----------
         rows : ndarray of int, shape (m,)
+            Numbers of the rows, from 0.
         """
         from astropy.table import Table
 
-        # Positions on the sky stay, as those in pixels are written anew.
+        # Positions on the sky stay; positions in pixels are written anew.
         further_columns, positions = Table(), self.positions()
         read = {self._identifier(), *(() if positions.sky else (positions.first, positions.second))}
         for name in self.table.colnames[:900]:
             column = self.table[name]
-            # Times, coordinates and arrays have no place in a table of numbers.
+            # Times, coordinates and arrays do not belong in a table of numbers.
             if name in read or not isinstance(column, np.ndarray) or column.ndim != 1:
                 continue
             # Texts of pandas are objects; so are the arrays of variable length of FITS tables.
@@ -286,24 +288,24 @@ class Catalogue:
         return name_wanted if name_wanted in names else name_in_any_case(names, name_wanted)
 
     def _column(self, name: str) -> Column:
-        """Return a column; ObservationError if there is none, or it is no array."""
+        """Return a column; ObservationError if it does not exist, or is not an array."""
         try:
-            resolved = self._resolve(name)
+            column_name = self._resolve(name)
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
-        if resolved is None:
+        if column_name is None:
             names = self.table.colnames
             hint = did_you_mean(name, names)
             raise ObservationError(self.path, f"no column {name!r}; found {shorten(names)}{hint}")
         # Coordinates and times are objects of astropy, not arrays.
-        column = self.table[resolved]
+        column = self.table[column_name]
         if not isinstance(column, np.ndarray):
             raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
         return column
 
 
 def _texts(column: Column) -> list[str]:
-    """Return the values of a column as text without blanks around it, "" where there is none.
+    """Return the values of a column as text without blanks around it, "" where one is missing.
 
     Bytes are decoded as UTF-8; masked values are "".
     """
@@ -319,7 +321,7 @@ def read_catalogue(path: Path) -> Catalogue:
     Raises
     ------
     ObservationError
-        If the file cannot be read, or has no stars.
+        If the file cannot be read, or does not contain stars.
     """
     return _catalogue(path, read_list_table(path))
 
@@ -340,7 +342,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
         return star_list
     if isinstance(star_list, str | Path):
         return read_catalogue(Path(star_list))
-    # What is no table becomes columns of one.
+    # Anything but a table becomes columns of a table.
     path = Path("catalogue")
     with reading(path):
         # A table of sky coordinates; an array or a sequence of pairs; else a table.
@@ -351,7 +353,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
             star_list = {"sky": star_list.reshape(-1)}
         elif is_pairs:
             star_list = _pairs(path, star_list)
-        # pandas has no units; astropy reads its records.
+        # pandas does not have units; astropy reads its records.
         records = getattr(star_list, "to_records", None)  # of a DataFrame
         # Quantities become columns with units.
         table = Table(star_list if records is None else records(index=False))
@@ -368,8 +370,8 @@ def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
     ObservationError
         If the positions have another unit than pixels, or are not numbers of shape (n, 2).
     """
-    # Positions with another unit than pixels are on the sky, and have no WCS with them.
-    values, mask, unit = parts_of_array(star_list)
+    # Positions with another unit than pixels are on the sky, and come without a WCS.
+    values, mask, unit = split_array(star_list)
     if unit not in ("", "pix", "pixel"):
         raise ObservationError(
             path, f"positions in {unit}, expected pixels; sky coordinates go as a SkyCoord"
@@ -390,7 +392,7 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
     Raises
     ------
     ObservationError
-        If the table has no row.
+        If the table is empty.
     """
     from astropy.coordinates import SkyCoord
 
@@ -403,21 +405,21 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
         with reading(path):
             icrs, table = table[sky[0]].icrs, table.copy(copy_data=False)
             for name, angle in (("ra", icrs.ra), ("dec", icrs.dec)):
-                values, mask, _ = parts_of_array(angle.deg)
+                values, mask, _ = split_array(angle.deg)
                 table[name] = np.where(mask if mask is not None else False, np.nan, values)
             table.remove_column(sky[0])
     return Catalogue(path, table)
 
 
 def require_sky(stars: StarList, purpose: str) -> None:
-    """Refuse a star list of several images that has no sky coordinates.
+    """Raise an error if a star list of several images lacks sky coordinates.
 
     Parameters
     ----------
     stars : path-like, table or positions
         The list (`as_catalogue`).
     purpose : str
-        What needs sky coordinates, for the message.
+        Task that needs sky coordinates, for the message.
     """
     table = as_catalogue(stars)
     if not table.positions().sky:

@@ -16,42 +16,44 @@ import numpy as np
 
 from psfdae.base.types import HDUList, Header, ImageHDU, NDData, PrimaryHDU, Quantity
 from psfdae.image.errors import ObservationError, reading
-from psfdae.image.fits_file import PlainFile, temporary_file
+from psfdae.image.fits_file import PlainFile, write_temporary
 
 Image: TypeAlias = str | Path | np.ndarray | NDData | HDUList | PrimaryHDU | ImageHDU
 """Image as the public calls take it; see `as_image`."""
 
 
 def as_images(images: Any) -> list[Path | PlainFile | np.ndarray]:
-    """Return what is read for an image, or for each of several; see `as_image`.
+    """Return the path, array or file to read for each image; see `as_image`.
 
     Parameters
     ----------
-    images : one of what `as_image` takes, or several of them
+    images : image or sequence of images
+        Images of any type that `as_image` takes.
 
     Returns
     -------
     list of Path, PlainFile or ndarray
-        One for each image; an HDUList is the parts of one image.
+        One for each image; an HDUList holds the parts of one image.
     """
     from astropy.io.fits import HDUList
 
-    # An HDUList is a list of the parts of one image, and an array could be iterated over.
+    # An HDUList lists the parts of one image, and an array could be iterated over.
     iterable = hasattr(images, "__iter__") and not isinstance(images, str | HDUList | np.ndarray)
     return [as_image(container) for container in images] if iterable else [as_image(images)]
 
 
 def as_image(image: Any) -> Path | PlainFile | np.ndarray:
-    """Return what is read for an image: a path, an array of plain numbers, or a FITS file.
+    """Return the source to read of an image: a path, an array of plain numbers, or a FITS file.
 
     Parameters
     ----------
     image : path-like, array, masked array, Quantity, NDData, HDU, or HDUList
+        Image; mask, uncertainty, unit and WCS are kept.
 
     Raises
     ------
     ObservationError
-        If it is none of these, or cannot be written as FITS.
+        If the type is another one, or the image cannot be written as FITS.
     """
     from astropy.io import fits
     from astropy.nddata import NDData
@@ -62,39 +64,42 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
     name = Path(type(image).__name__)
     if isinstance(image, np.ndarray):
         # An array without mask and unit needs no file.
-        data, mask, unit = parts_of_array(image)
+        data, mask, unit = split_array(image)
         if mask is None and not unit:
             return data
         header = fits.Header({"BUNIT": unit} if unit else {})
-        return _temporary_fits(name, lambda: _hdus(data, header, mask, None))
+        return _write_fits(name, lambda: _build_hdus(data, header, mask, None))
     if isinstance(image, fits.HDUList):
-        return _temporary_fits(Path(image.filename() or name), lambda: image)
+        return _write_fits(Path(image.filename() or name), lambda: image)
     if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
         # An extension stands behind a primary one.
         first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
-        return _temporary_fits(name, lambda: fits.HDUList([*first, image.copy()]))
+        return _write_fits(name, lambda: fits.HDUList([*first, image.copy()]))
     if not isinstance(image, NDData):
         raise ObservationError(
             name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
         )
-    return _temporary_fits(name, lambda: _of_nddata(image))
+    return _write_fits(name, lambda: _convert_nddata(image))
 
 
-def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
-    """Return numbers, mask (None without one) and unit ("" without one) of an array of any kind.
+def split_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Split an array of any kind into numbers, mask (None without) and unit ("" without).
 
     Masked arrays of numpy, and quantities of astropy, also masked ones.
 
     Parameters
     ----------
     values : array, masked array, Quantity or masked Quantity
+        Array of any shape.
 
     Returns
     -------
     numbers : ndarray
+        Plain numbers of the array.
     mask : ndarray of bool or None, of the same shape
+        True where a value is masked.
     unit : str
-        As FITS writes it.
+        Unit as FITS writes it.
     """
     if isinstance(values, np.ma.MaskedArray):
         return np.asarray(values.data), np.ma.getmaskarray(values), ""
@@ -106,8 +111,8 @@ def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
     return array, None if mask is None else np.asarray(mask, bool), fits_unit(unit)
 
 
-def sigma_of(data: NDData) -> np.ndarray | None:
-    """Return σ of the pixels, in the unit of the data; None without an uncertainty.
+def compute_sigma(data: NDData) -> np.ndarray | None:
+    """Compute σ of the pixels, in the unit of the data; None without an uncertainty.
 
     An uncertainty of another kind, such as a variance or its inverse, is converted into σ.
     """
@@ -123,12 +128,13 @@ def sigma_of(data: NDData) -> np.ndarray | None:
     return np.asarray(values)
 
 
-def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -> float | None:
-    """Return a quantity as a number of the first of some units; plain numbers stay.
+def to_unit(value: float | Quantity | None, units: str, name: str, path: Path) -> float | None:
+    """Convert a quantity to a number of the first of some units; plain numbers stay.
 
     Parameters
     ----------
     value : float, Quantity or None
+        Value given by the user.
     units : str
         Names of astropy, separated by blanks; the others mean the same as the first, such as
         counts, adu and DN.
@@ -154,10 +160,10 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
     raise ObservationError(path, f"{name}={value}: expected a number of {target_unit}")
 
 
-def _of_nddata(data: NDData) -> HDUList:
-    """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS.
+def _convert_nddata(data: NDData) -> HDUList:
+    """Convert an NDData to FITS: image, mask and σ, with its meta as header, unit and WCS.
 
-    What FITS cannot hold is left out: meta that are no numbers or texts, and a WCS of another kind.
+    Meta other than numbers and texts, and a WCS of another kind than FITS has, are left out.
     """
     from astropy.io import fits
     from astropy.wcs import WCS
@@ -165,13 +171,13 @@ def _of_nddata(data: NDData) -> HDUList:
     # The meta of CCDData is the header that it was read with.
     header = fits.Header()
     for key, value in data.meta.items():
-        # Meta may hold anything; what is no card of FITS is left out.
+        # Meta may hold anything; values that cannot be FITS cards are left out.
         if isinstance(value, str | int | float | bool) and not str(key).startswith("NAXIS"):
             with suppress(ValueError):
                 header[str(key)] = value
     if unit := fits_unit(data.unit):
         header["BUNIT"] = unit
-    hdus = _hdus(np.asarray(data.data), header, data.mask, sigma_of(data))
+    hdus = _build_hdus(np.asarray(data.data), header, data.mask, compute_sigma(data))
     # A WCS of another kind than FITS has is left out.
     wcs = getattr(data.wcs, "low_level_wcs", data.wcs)
     if isinstance(wcs, WCS):
@@ -191,7 +197,7 @@ def fits_unit(unit: Any) -> str:
         return str(unit)
 
 
-def _hdus(
+def _build_hdus(
     data: np.ndarray, header: Header, mask: np.ndarray | None, sigma: np.ndarray | None
 ) -> HDUList:
     """Return an image with its mask as DQ and σ as ERR.
@@ -199,15 +205,17 @@ def _hdus(
     Parameters
     ----------
     data : ndarray
+        Pixels of the image, or a cube of stamps.
     header : Header
+        Header of the image.
     mask : ndarray or None
-        Truth values or bits, of the shape of the data or that of one stamp of a cube.
+        Truth values or bits, of the shape of the data or of one stamp of a cube.
     sigma : ndarray or None
-        σ of the pixels, likewise.
+        σ of the pixels, of the shape of the data or of one stamp.
     """
     from astropy.io import fits
 
-    # FITS has no half precision and no truth values.
+    # FITS supports neither half precision nor truth values.
     narrow = data.dtype.kind == "b" or data.dtype == np.float16
     hdus = fits.HDUList([fits.PrimaryHDU(data.astype(np.float32) if narrow else data, header)])
     # A mask of truth values, or of bits; one for all stamps of a cube is repeated.
@@ -220,18 +228,18 @@ def _hdus(
     return hdus
 
 
-def _temporary_fits(name: Path, hdus: Callable[[], HDUList]) -> PlainFile:
+def _write_fits(name: Path, hdus: Callable[[], HDUList]) -> PlainFile:
     """Return a temporary file with an image, which is called `name` in messages.
 
     Parameters
     ----------
     name : Path
-        What messages call the image.
+        Name of the image in messages.
     hdus : callable
-        Returns the HDUList, inside `reading`, as what it makes may not be written as FITS.
+        Returns the HDUList; called inside `reading`, as its content may not be valid FITS.
     """
     content = io.BytesIO()
     with reading(name):
         hdus().writeto(content, output_verify="silentfix+ignore")
         content.seek(0)
-        return temporary_file(name, content)
+        return write_temporary(name, content)

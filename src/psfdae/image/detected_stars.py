@@ -38,7 +38,7 @@ def detect(image: Image, threshold: float = 5.0, **options: Unpack[PixelKeywords
     Raises
     ------
     Error
-        If the image or a statement cannot be used, or there is no star.
+        If the image or an option cannot be used, or no star is found.
 
     Examples
     --------
@@ -46,7 +46,7 @@ def detect(image: Image, threshold: float = 5.0, **options: Unpack[PixelKeywords
     >>> len(detected), detected.colnames
     (36, ['id', 'x', 'y', 'flux_iso', 'background'])
     """
-    return find_stars(ImageInput.of(image, {**options, "detect": threshold}))
+    return find_stars(ImageInput.build(image, {**options, "detect": threshold}))
 
 
 def find_stars(source: ImageInput) -> QTable:

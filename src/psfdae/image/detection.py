@@ -1,9 +1,10 @@
-"""Stars of an image without a list: its sky, what stands above it, and whether a list fits.
+"""Stars of an image without a list: its sky, the sources above it, and whether a list fits.
 
-In: an image (h, w) and its bad pixels. Out: `Sky`, the image without its sky, which finds stars.
+Inputs: an image (h, w) and its bad pixels. Output: `Sky`, the image without its sky, which finds
+stars.
 
 photutils finds them: sources are connected pixels above the sky (Bertin & Arnouts
-1996, A&AS 117, 393), those that touch parted where a saddle is deep enough.
+1996, A&AS 117, 393); touching sources are parted where a saddle is deep enough.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 import scipy
 
-from psfdae.image.interpolation import interpolated
+from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, SkyStructure, sky_level
 from psfdae.image.source_size import measure_size
 from psfdae.stars.moments import FWHM_OF_SIGMA
@@ -23,7 +24,7 @@ from psfdae.stars.moments import FWHM_OF_SIGMA
 
 @dataclass(frozen=True)
 class Sky:
-    """An image (h, w) with its sky subtracted, and what was subtracted, in single precision.
+    """An image (h, w) with its sky subtracted, and the sky, in single precision.
 
     Attributes
     ----------
@@ -32,12 +33,13 @@ class Sky:
     level, noise : ndarray, shape (h, w)
         Level of the sky, and σ of each pixel.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     noise_scale : float
         Factor of the map of σ, NaN without one.
     structure : SkyStructure
+        Steps of the sky's level and of its pixels.
     notes : tuple of str
-        Sentences on what is unusual in the sky.
+        Sentences on unusual properties of the sky.
     """
 
     flat: np.ndarray
@@ -48,7 +50,7 @@ class Sky:
     structure: SkyStructure = field(default_factory=SkyStructure)
     notes: tuple[str, ...] = ()
     least_px: ClassVar[int] = 5
-    """Least number of connected pixels above the threshold that are a source."""
+    """Minimum number of connected pixels above the threshold that are a source."""
 
     @cached_property
     def holes(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class Sky:
         return np.asarray(self.bad & (around > 0.5))
 
     def _above(self, threshold: float, fwhm_px: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smoothed image, and where its threshold is, (h, w) each.
+        """Return the smoothed image, and the threshold of each pixel, (h, w) each.
 
         It is smoothed slightly, by [1, 2, 1]/4 along both axes, or by a Gaussian of that FWHM.
         """
@@ -86,7 +88,7 @@ class Sky:
         Parameters
         ----------
         threshold : float
-            Least height of a source, in σ of the smoothed image.
+            Minimum height of a source, in σ of the smoothed image.
         wide_px : float
             FWHM from which stars are wide.
         """
@@ -120,7 +122,7 @@ class Sky:
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
             return {"id": np.empty(0, np.int64)}
-        # Centroids and fluxes; a source of negative pixels only has none.
+        # Centroids and fluxes; they are NaN for a source of negative pixels only.
         catalogue = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
         columns = catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux
         x, y, flux = (np.atleast_1d(column) for column in columns)
@@ -133,7 +135,7 @@ class Sky:
         column = np.clip(np.rint(x), 0, width - 1).astype(int)
         level = self.level[row, column]
 
-        def rounded(values: np.ndarray) -> np.ndarray:
+        def round_digits(values: np.ndarray) -> np.ndarray:
             """Return eight digits, not decimals: the unit of an image may be of any size."""
             return np.array([float(f"{value:.8g}") for value in values.astype(float).tolist()])
 
@@ -141,11 +143,11 @@ class Sky:
             "id": np.arange(1, len(x) + 1),
             "X_IMAGE": np.round(x + 1, 3),
             "Y_IMAGE": np.round(y + 1, 3),
-            "FLUX_ISO": rounded(flux),
-            "BACKGROUND": rounded(level),
+            "FLUX_ISO": round_digits(flux),
+            "BACKGROUND": round_digits(level),
         }
 
-    def covered(self, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:
+    def is_on_source(self, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:
         """Return True for pixels (n,) on which a source stands; never off the image."""
         # As photutils parts an image, which takes a second to be loaded.
         smooth, limit = self._above(threshold)
@@ -165,26 +167,27 @@ class Sky:
         return inside
 
 
-def sky_of(
+def find_sky(
     image: np.ndarray,
     bad: np.ndarray,
     sigma: np.ndarray | None = None,
     least_noise: float = 0.0,
-    measured: SkyLevel | None = None,
+    known_sky: SkyLevel | None = None,
     structure: SkyStructure | None = None,
 ) -> Sky:
-    """Return an image without its sky, and what was subtracted.
+    """Subtract the sky of an image; return the image with its sky.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Image, in any unit.
     bad : ndarray of bool, shape (h, w)
-        Pixels that do not count.
+        Pixels to ignore.
     sigma : ndarray, shape (h, w), optional
-        σ of every pixel but for a factor, which is found here.
+        σ of every pixel but for a factor, which is fitted here.
     least_noise : float
-        The noise is nowhere below this.
-    measured : SkyLevel, optional
+        Lower limit of the noise, in the unit of the image.
+    known_sky : SkyLevel, optional
         Sky of the image, if it was measured before.
     structure : SkyStructure, optional
         Structure of the sky, if it is known from the image with its stars.
@@ -192,20 +195,20 @@ def sky_of(
     Raises
     ------
     ValueError
-        If no mesh has enough pixels that count.
+        If no mesh has enough good pixels.
     """
-    # Level and noise by the pixels that count.
+    # Level and noise from the good pixels.
     image = np.where(bad, 0.0, image)
-    sky = sky_level(image, bad, structure) if measured is None else measured
+    sky = sky_level(image, bad, structure) if known_sky is None else known_sky
     level, noise, structure, notes = sky
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
     noise = np.maximum(noise, least_noise, out=noise)
-    # A map of σ is scaled so that its median is that of the measured noise.
+    # A map of σ is scaled so that its median equals the median of the measured noise.
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
-        # Bad pixels, of which the map may have no σ, keep the noise of the sky around.
+        # Bad pixels, for which the map may lack σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
-    flat = interpolated((image - level).astype(np.float32), bad)[0]
+    flat = fill_bad((image - level).astype(np.float32), bad)[0]
     return Sky(flat, level, noise, bad, scale, structure, notes)

@@ -1,8 +1,8 @@
 """Position of an image's pixels on the detector by the header, and the offset of two images.
 
-In: the headers of two images. Out: the position of the one in the other, in pixels. Programs write
-the place under different keys, which count from different zeros, so that the numbers under a key of
-one header are compared with those under the same key of the other one.
+Inputs: the headers of two images. Output: the position of one in the other, in pixels. Programs
+write the position under different keys, which count from different zeros, so that the numbers under
+a key of one header are compared with the numbers under the same key of the other one.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def find_offset(
 ) -> np.ndarray | None:
     """Return the position (x, y) of an image's first pixel in another image, of the training.
 
-    A header without a place is taken for that of the whole detector, if this image then holds all
-    of the other one. None where the headers do not show the offset.
+    A header without a position is taken for the whole detector's, if this image then holds all of
+    the other one. None where the headers do not show the offset.
 
     Parameters
     ----------

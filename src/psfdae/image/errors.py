@@ -1,4 +1,4 @@
-"""The one error of files that observers bring, and their texts made fit to be shown."""
+"""The error raised for input files that cannot be used, and functions that make texts printable."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ def shorten(names: list[str], length_max: int = 20) -> str:
     Parameters
     ----------
     names : list of str
-        Each is cut after 40 characters.
+        Names; each is cut after 40 characters.
     length_max : int
+        Maximum number of names.
     """
     ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""
     return ", ".join(name[:40] for name in names[:length_max]) + ellipsis if names else "none"
@@ -55,8 +56,8 @@ _ONE_AT_A_TIME = threading.RLock()
 def silent() -> Iterator[None]:
     """Silence warnings, log messages and floating-point errors of libraries.
 
-    Filters of warnings belong to the process: one thread at a time is silent, and restores what it
-    found.
+    Filters of warnings belong to the process: one thread at a time is silent, and restores the
+    filters afterwards.
     """
     from astropy import log
 
@@ -81,10 +82,10 @@ def _no_space(error: OSError) -> str:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Silence libraries while they read a file, and turn what they raise about it into one error.
+    """Silence libraries while they read a file, and turn their errors into `ObservationError`.
 
     Libraries raise a dozen kinds of errors on damaged files (struct, index, key, assertion, zlib,
-    …) that no list would complete; errors of the program itself pass as they are.
+    …), which no list would complete; errors of the program itself pass unchanged.
 
     Raises
     ------
@@ -94,11 +95,11 @@ def reading(path: str | Path) -> Iterator[None]:
     with silent():
         try:
             yield
-        # Refusals of our own pass; those of the operating system get plain words.
+        # Errors of our own pass; errors of the operating system get plain words.
         except ObservationError:
             raise
         except FileNotFoundError as error:
-            # Python names no file if every folder for temporary files is full.
+            # Python does not name a file if every folder for temporary files is full.
             if error.filename is None:
                 raise ObservationError(path, _no_space(error)) from None
             reason = no_such_file(Path(path)).removeprefix(f"{path}: ")
@@ -113,7 +114,7 @@ def reading(path: str | Path) -> Iterator[None]:
             # Only the copy of a packed image is written while it is read.
             if isinstance(error, OSError) and error.errno in NO_SPACE:
                 raise ObservationError(path, _no_space(error)) from None
-            # A missing package and an undefined name are no property of a file. Neither is a wrong
+            # A missing package and an undefined name are not faults of a file. Neither is a wrong
             # type, attribute, index or assertion in a line of psfdae's own; libraries raise these
             # on damaged files, in their own lines.
             *_, (frame, _) = walk_tb(error.__traceback__)

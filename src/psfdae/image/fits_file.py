@@ -1,7 +1,7 @@
 """Images in FITS files of any origin, found and read piece by piece.
 
-A path and perhaps an extension go in. `find_image` returns an `ImageFile`, which describes one
-image without its pixels; `open_pixels` reads these. Files that are compressed as a whole (.gz,
+Inputs: a path and perhaps an extension. `find_image` returns an `ImageFile`, which describes one
+image without its pixels; `open_pixels` reads the pixels. Files that are compressed as a whole (.gz,
 .bz2, .xz, .zip) are unpacked to a temporary file first; astropy reads tile-compressed images (.fz).
 """
 
@@ -44,7 +44,7 @@ Card = tuple[str, str | float | None, str]
 # Files.
 
 
-def only_member(file: IO[bytes]) -> IO[bytes]:
+def open_member(file: IO[bytes]) -> IO[bytes]:
     """Open the only file in a zip file.
 
     Raises
@@ -52,18 +52,18 @@ def only_member(file: IO[bytes]) -> IO[bytes]:
     BadZipFile
         If the zip file holds another number of files.
     """
-    packed = zipfile.ZipFile(file)
-    names = packed.namelist()
+    archive = zipfile.ZipFile(file)
+    names = archive.namelist()
     if len(names) != 1:
         raise zipfile.BadZipFile(f"{len(names)} files in a zip file, expected one")
-    return packed.open(names[0])
+    return archive.open(names[0])
 
 
 UNPACK: dict[bytes, Callable[[IO[bytes]], Any]] = {
     b"\x1f\x8b": gzip.open,
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ\x00": lzma.LZMAFile,
-    b"PK\x03\x04": only_member,
+    b"PK\x03\x04": open_member,
 }
 """How files that are compressed as a whole are read, by their first bytes."""
 
@@ -92,10 +92,11 @@ class PlainFile:
     Attributes
     ----------
     name : Path
-        What messages call it.
+        Name of the file in messages.
     path : Path
-        What is opened. A temporary copy exists as long as this object.
+        File to open. A temporary copy exists as long as this object.
     is_copy : bool
+        True for a temporary copy.
     """
 
     name: Path
@@ -106,7 +107,7 @@ class PlainFile:
         """Pickle a temporary copy by its content."""
         if not self.is_copy:
             return type(self), (self.name, self.path)
-        return temporary_file, (self.name, io.BytesIO(self.path.read_bytes()))
+        return write_temporary, (self.name, io.BytesIO(self.path.read_bytes()))
 
 
 def plain_file(path: Path) -> PlainFile:
@@ -115,12 +116,12 @@ def plain_file(path: Path) -> PlainFile:
     Returns
     -------
     PlainFile
-        The file itself, or a temporary copy of what is packed in it.
+        The file itself, or a temporary copy of its unpacked content.
 
     Raises
     ------
     ObservationError
-        If there is no such file, or it is not a FITS file.
+        If the file does not exist, or is not a FITS file.
     """
     file, start = unpack_file(path)
     if not start.startswith(b"SIMPLE  ="):
@@ -132,21 +133,21 @@ def unpack_file(path: Path) -> tuple[PlainFile, bytes]:
     """Return a file of any format, unpacked if need be, and its first 80 bytes."""
     require_file(path)
     with reading(path), path.open("rb") as file:
-        # The first bytes tell how the file is compressed, if it is. A model of psfdae begins with
+        # The first bytes show how the file is compressed, if it is. A model of psfdae begins with
         # eight bytes of any value, and a brace.
         start = file.read(80)
         file.seek(0)
         for magic, unpack in UNPACK.items():
             if start.startswith(magic) and start[8:9] != b"{":
                 with unpack(file) as content:
-                    copy = temporary_file(path, content, compute_unpacked_max(path.stat().st_size))
+                    copy = write_temporary(path, content, compute_unpacked_max(path.stat().st_size))
                 with copy.path.open("rb") as plain:
                     return copy, plain.read(80)
     return PlainFile(path, path), start
 
 
 def compute_unpacked_max(packed_bytes: int) -> int:
-    """Return the largest number of bytes that is unpacked from so many.
+    """Return the maximum number of bytes to unpack from a number of packed bytes.
 
     It is the memory of the machine, or less: deflate packs at most 1032 bytes into one, and Rice's
     coding fewer. No image of the sky with noise comes near that. Small files may have 64 MB.
@@ -155,17 +156,17 @@ def compute_unpacked_max(packed_bytes: int) -> int:
     return min(memory_bytes, max(2**26, 1032 * packed_bytes))
 
 
-def temporary_file(name: Path, content: IO[bytes], bytes_max: float = math.inf) -> PlainFile:
-    """Return a FITS file of this content, which exists as long as the object that is returned.
+def write_temporary(name: Path, content: IO[bytes], bytes_max: float = math.inf) -> PlainFile:
+    """Write a temporary FITS file of this content, which exists as long as the returned object.
 
     Temporary files of processes that were killed are removed.
 
     Parameters
     ----------
     name : Path
-        What messages call the file.
+        Name of the file in messages.
     content : file
-        Open for reading bytes, at the start of what is copied.
+        File open for reading bytes, at the start of the content to copy.
     bytes_max : float
         Largest size of the copy.
 
@@ -208,11 +209,12 @@ def open_hdus(file: PlainFile, as_stored: bool = False, **options: Any) -> HDULi
     Parameters
     ----------
     file : PlainFile
+        File, not compressed as a whole.
     as_stored : bool
         Leave pixels as they are stored, for `ImageFile.physical`: neither scaled nor with blank
         pixels as NaN.
     **options
-        Those of `astropy.io.fits.open`.
+        Options of `astropy.io.fits.open`.
     """
     from astropy.io import fits
 
@@ -229,7 +231,7 @@ def check_counts(path: Path) -> None:
     """
     from astropy.io import fits
 
-    # Header after header, to the end of the file; of a header without an end, astropy says so.
+    # Header after header, to the end of the file; astropy reports a header without an end.
     with path.open("rb") as file, suppress(OSError, EOFError):
         while header := fits.Header.fromfile(file):
             for key in ("NAXIS", "ZNAXIS", "TFIELDS"):
@@ -248,14 +250,15 @@ class ImageFile:
     Attributes
     ----------
     file : PlainFile
+        File with the image.
     index : int
-        Number of the extension.
+        Number of the extension, from 0.
     shape : tuple of int
         (h, w) or (n, h, w), without the `leading` axes of length 1 before these.
     leading : int
         Number of these axes.
     bscale, bzero, blank : float, float, int or None
-        Values are bscale·stored + bzero, and NaN where `blank` is stored.
+        Values are bscale·raw + bzero, and NaN where the raw value is `blank`.
     headers : tuple of Header
         Its own, then the primary one if it is another; none for an array.
     wcs : WCS or None
@@ -263,7 +266,7 @@ class ImageFile:
     values : ndarray or None
         Pixels of an image that is an array and in no file (`array_image`).
     unit_factor : float
-        Factor from the unit of the file to that of the pixels that are read (`to_noise_unit`).
+        Factor from the file's unit to the unit of the pixels that are read (`to_noise_unit`).
     """
 
     file: PlainFile
@@ -295,30 +298,27 @@ class ImageFile:
         return next((u.strip() for u in units if isinstance(u, str) and u.strip()), "")
 
     def card(self, key: str) -> Any:
-        """Return the value of a card of its own header; None if that has none.
-
-        None as well if the card cannot be parsed.
-        """
+        """Return the value of a card of its own header; None if absent or not parseable."""
         return card_value(self.headers[0], key) if self.headers else None
 
-    def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
-        """Return physical values of stored ones, in native byte order, same shape.
+    def physical(self, raw: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
+        """Return physical values of raw ones, in native byte order, same shape.
 
         Parameters
         ----------
-        stored : ndarray
+        raw : ndarray
             Pixels as the file has them: neither scaled nor with blank pixels as NaN.
         dtype : dtype
             Type of the values.
         """
-        # value = bscale · stored + bzero, in double precision; without a scale, values are
+        # value = bscale · raw + bzero, in double precision; without a scale, values are
         # converted once.
         if self.bscale == 1.0 and self.bzero == 0.0:
-            values = stored.astype(dtype)
+            values = raw.astype(dtype)
         else:
-            values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
-        if self.blank is not None and stored.dtype.kind in "iu":
-            values[stored == self.blank] = np.nan
+            values = (raw.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
+        if self.blank is not None and raw.dtype.kind in "iu":
+            values[raw == self.blank] = np.nan
         return values
 
     def times(self, factor: float) -> ImageFile:
@@ -349,12 +349,12 @@ class ImageFile:
         return replace(self, shape=self.shape[1:], leading=self.leading + 1)
 
     def provenance(self) -> list[Card]:
-        """Return the cards that say where the stars come from, those that can be parsed.
+        """Return the cards that describe the origin of the stars and can be parsed.
 
         These are object, telescope, instrument, observer, filter, dates, exposure time, air mass
         and unit.
         """
-        # Of a key that stands in both headers, the value of the image's own.
+        # Of a key in both headers, the value of the image's own is used.
         cards: list[Card] = []
         for key in (
             *("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER"),
@@ -370,7 +370,7 @@ class ImageFile:
 
 def card_value(header: Header, key: str) -> Any:
     """Return the value of a card; None if it is absent or cannot be parsed."""
-    with suppress(Exception):  # astropy parses on access, and raises what the damage brings about
+    with suppress(Exception):  # astropy parses on access, and raises errors of any kind
         return header[key]
     return None
 
@@ -381,13 +381,14 @@ def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
     Parameters
     ----------
     values : ndarray
+        Pixels, of any type of numbers.
     name : str
-        What messages call it.
+        Name of the array in messages.
 
     Raises
     ------
     ObservationError
-        If the array does not hold numbers, has not two or three axes, or is empty.
+        If the array does not hold numbers, does not have two or three axes, or is empty.
     """
     # A plane, or stamps along the first axis, of any type of numbers.
     values, path = np.asarray(values), Path(name)
@@ -407,7 +408,7 @@ def find_image(
     Parameters
     ----------
     path : Path, PlainFile, or ndarray
-        An array is an image itself.
+        File; an array is an image itself.
     extension : str or int, optional
         A name (case does not matter), "NAME,version" or a number (0 is the primary one). By default
         the only image is taken that is not a mask, an error or the like (`is_science`), or the
@@ -428,29 +429,29 @@ def find_image(
     path = file.name
     with reading(path), open_hdus(file, as_stored=True) as hdus:
         hdu = choose_extension(path, hdus, extension)
-        # Its own header, then that of the file.
+        # Its own header, then the file's primary one.
         index, header = hdus.index(hdu), hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
         shape = tuple(int(n) for n in hdu.shape)
         # The size in the file follows from shape and type; a tile-compressed image is stored as a
-        # table, for which astropy has no public attribute.
-        stored = hdu._bintable if isinstance(hdu, fits.CompImageHDU) else hdu
+        # table, for which astropy lacks a public attribute.
+        table = hdu._bintable if isinstance(hdu, fits.CompImageHDU) else hdu
         # The decoders of two codings (astropy 8.0) take lengths and sizes from the tiles: a wrong
         # byte makes them write outside of their memory.
-        coding = stored.header.get("ZCMPTYPE")
+        coding = table.header.get("ZCMPTYPE")
         if coding in ("HCOMPRESS_1", "PLIO_1"):
             raise ObservationError(path, f"tiles compressed with {coding}; decompress the file")
-        missing = hdu.fileinfo()["datLoc"] + stored.size - file.path.stat().st_size
+        missing = hdu.fileinfo()["datLoc"] + table.size - file.path.stat().st_size
         if missing > 0:
             raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
         # Tiles can share their bytes, so that a small file unpacks to any size.
         size = math.prod(shape) * abs(header["BITPIX"]) // 8
-        if stored is not hdu and size > compute_unpacked_max(stored.size):
-            raise ObservationError(path, f"damaged: {size} bytes in tiles of {stored.size} bytes")
-        # values = BSCALE · stored + BZERO
+        if table is not hdu and size > compute_unpacked_max(table.size):
+            raise ObservationError(path, f"damaged: {size} bytes in tiles of {table.size} bytes")
+        # values = BSCALE · raw + BZERO
         bscale, bzero, blank = (card_value(header, key) for key in ("BSCALE", "BZERO", "BLANK"))
         bscale, bzero = float(1.0 if bscale is None else bscale), float(bzero or 0.0)
-        wcs = celestial_wcs(header, hdus)
+        wcs = read_wcs(header, hdus)
     # Leading axes of length 1 are dropped while more than three remain.
     leading = 0
     while len(shape) > 3 and shape[0] == 1:
@@ -464,17 +465,18 @@ def find_image(
 def science_images(path: Path) -> dict[str, int]:
     """Return the numbers of all images of a file but masks, errors and the like, by their names.
 
-    The name is meant for file names: the extension's own, or its number where it has none, or one
-    that another extension has, too, that looks like a number, or that has other characters.
+    The name is meant for file names: the extension's own, or its number where it lacks a name, or
+    the name is not unique, looks like a number, or contains other characters.
 
     Parameters
     ----------
     path : Path
+        FITS file, which may be compressed.
 
     Raises
     ------
     ObservationError
-        If the file has none, or cannot be read.
+        If the file does not contain such an image, or cannot be read.
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
         images = {k: hdu.name for k, hdu in enumerate(hdus) if has_pixels(hdu)}
@@ -491,7 +493,7 @@ def science_images(path: Path) -> dict[str, int]:
 
 
 def map_kind_by_name(name: str) -> str | None:
-    """Return which map of an image an extension is: "mask", "error", "variance", "weight", "other".
+    """Return the kind of map of an extension: "mask", "error", "variance", "weight", "other".
 
     By the names that JWST, HST, LCO, LSST, Gemini and ccdproc give them; None for another name.
     """
@@ -510,7 +512,7 @@ def map_kind_by_name(name: str) -> str | None:
 
 
 def is_science(name: str) -> bool:
-    """Return True unless the name is that of a map which goes with an image, such as DQ."""
+    """Return True unless the name belongs to a map that accompanies an image, such as DQ."""
     return map_kind_by_name(name) is None
 
 
@@ -520,47 +522,47 @@ def choose_extension(path: Path, hdus: HDUList, extension: str | int | None) -> 
     Raises
     ------
     ObservationError
-        If the extension that is stated does not exist or holds no image, or if none is stated and
-        no image, or several, may be meant; it lists what the file has.
+        If the given extension does not exist or is not an image, or if none is given and no image,
+        or several, may be meant; the message lists the extensions of the file.
     """
     # Number, name and size of each extension, for messages.
     labels = []
     for k, hdu in enumerate(hdus):
         size = "×".join(map(str, hdu.shape)) if has_pixels(hdu) else "no image"
         labels.append(f"{k} {hdu.name or '(no name)'} ({size})")
-    listed = shorten(labels)
-    # The extension that is stated.
+    choices = shorten(labels)
+    # The given extension.
     if extension is not None:
-        hdu = _named(hdus, str(extension).strip())
+        hdu = _find_extension(hdus, str(extension).strip())
         if hdu is None:
-            raise ObservationError(path, f"no extension {extension!r}; the file has {listed}")
+            raise ObservationError(path, f"no extension {extension!r}; the file has {choices}")
         if not has_pixels(hdu):
             raise ObservationError(
-                path, f"extension {extension!r} holds no image; the file has {listed}"
+                path, f"extension {extension!r} holds no image; the file has {choices}"
             )
         return hdu
-    # Else the only image that is no mask, error or the like.
+    # Else the only image that is not a mask, error or the like.
     images = [hdu for hdu in hdus if has_pixels(hdu)]
     science = [hdu for hdu in images if is_science(hdu.name)]
     # The images of a star of Kepler or TESS are cells of a table.
     if not science and "APERTURE" in (hdu.name for hdu in images):
         problem = "a target pixel file: its images are in a table; write one as an image"
-        raise ObservationError(path, f"{problem}; the file has {listed}")
-    # Of a file that has nothing but such extensions, any may be meant.
+        raise ObservationError(path, f"{problem}; the file has {choices}")
+    # In a file with only such extensions, any may be meant.
     science = science or images
     if not science:
-        raise ObservationError(path, f"no image; the file has {listed}")
+        raise ObservationError(path, f"no image; the file has {choices}")
     # The science image of a pipeline, if there is just one, whatever other layers are called.
     for name in SCIENCE:
-        named = [hdu for hdu in science if hdu.name.upper() == name]
-        science = named if len(named) == 1 else science
+        matches = [hdu for hdu in science if hdu.name.upper() == name]
+        science = matches if len(matches) == 1 else science
     if len(science) > 1:
-        raise ObservationError(path, f"several images, choose an extension of {listed}")
+        raise ObservationError(path, f"several images, choose an extension of {choices}")
     return science[0]
 
 
-def _named(hdus: HDUList, text: str) -> Any:
-    """Return the extension of a number, or of a name with perhaps a version; None without one."""
+def _find_extension(hdus: HDUList, text: str) -> Any:
+    """Find the extension of a number, or of a name with perhaps a version; None without one."""
     if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
     # A name alone means its first extension, whatever the version.
@@ -576,13 +578,13 @@ def has_pixels(hdu: Any) -> bool:
     from astropy.io import fits
 
     is_image = isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
-    # Without axes, or with an axis of length 0, there are no pixels.
+    # Without axes, or with an axis of length 0, an extension is empty.
     has_size = is_image and bool(hdu.shape) and 0 not in hdu.shape
     return has_size and not isinstance(hdu, fits.GroupsHDU)
 
 
-def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
-    """Return the WCS of the first two pixel axes if they are celestial, in the order of the header.
+def read_wcs(header: Header, hdus: HDUList) -> WCS | None:
+    """Read the WCS of the first two pixel axes if they are celestial, in the order of the header.
 
     Right ascension may be its second axis: pixels stay x and y (`WCS.celestial` would exchange
     them). None without a scale, for other axes, for a frame that astropy does not know, and if the
@@ -604,8 +606,9 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
     with suppress(Exception):
         # Axes beyond the plane of the image, such as a wavelength, do not mix with the sky.
         wcs = WCS(header, fobj=hdus).sub([1, 2])
-        # The reference pixel has a place on the sky, in a frame with a way to ICRS, and this place
-        # has the same pixel: wcslib exchanges signs of TPV where declination is the first axis.
+        # The reference pixel has a position on the sky, in a frame that converts to ICRS, and this
+        # position has the same pixel: wcslib exchanges signs of TPV where declination is the first
+        # axis.
         pixel_to_sky(wcs, *wcs.wcs.crpix[:, None])
         pixel = wcs.wcs_world2pix(wcs.wcs_pix2world([wcs.wcs.crpix], 1), 1)
         return wcs if np.allclose(pixel, wcs.wcs.crpix, rtol=0.0, atol=1e-3) else None
@@ -615,7 +618,7 @@ def celestial_wcs(header: Header, hdus: HDUList) -> WCS | None:
 def sky_frame(wcs: WCS) -> BaseCoordinateFrame:
     """Return the frame of a celestial WCS.
 
-    astropy knows no ecliptic frame of a header, and lets RADESYS, which is of equatorial
+    astropy does not read ecliptic frames of headers, and lets RADESYS, which belongs to equatorial
     coordinates alone, override galactic axes.
 
     Raises
@@ -626,7 +629,7 @@ def sky_frame(wcs: WCS) -> BaseCoordinateFrame:
     from astropy.coordinates import BarycentricMeanEcliptic, Galactic, Supergalactic
     from astropy.wcs.utils import wcs_to_celestial_frame
 
-    # Ecliptic of the mean equinox, of 2000 if the header has none (Calabretta & Greisen 2002, A&A
+    # Ecliptic of the mean equinox, of 2000 if the header lacks one (Calabretta & Greisen 2002, A&A
     # 395, 1077, sect. 3.1).
     year = 2000.0 if np.isnan(wcs.wcs.equinox) else wcs.wcs.equinox
     ecliptic = BarycentricMeanEcliptic(equinox=f"J{year}")
@@ -653,14 +656,15 @@ class Pixels:
 
     Attributes
     ----------
-    stored : array-like
-        Pixels as stored: an array, or a section of a file that reads what it is asked for.
+    raw : array-like
+        Pixels as stored: an array, or a section of a file that is read where it is indexed.
     image : ImageFile
+        Image that the pixels belong to.
     dtype : dtype
         Type of the values.
     """
 
-    stored: Any
+    raw: Any
     image: ImageFile
     dtype: DTypeLike = np.float32
 
@@ -668,22 +672,23 @@ class Pixels:
         key = key if isinstance(key, tuple) else (key,)
         with reading(self.image.path):
             # Index 0 along each leading axis.
-            stored = np.asarray(self.stored[(0,) * self.image.leading + key])
-            return self.image.physical(stored, self.dtype)
+            raw = np.asarray(self.raw[(0,) * self.image.leading + key])
+            return self.image.physical(raw, self.dtype)
 
 
 @contextmanager
 def open_pixels(
     image: ImageFile, *, in_pieces: bool, dtype: DTypeLike = np.float32
 ) -> Iterator[Pixels]:
-    """Yield the values of an image as something to index, without the leading axes.
+    """Yield the values of an image, to be indexed without the leading axes.
 
     Parameters
     ----------
     image : ImageFile
+        Image to read.
     in_pieces : bool
-        True: each slice `[start:stop]` of the first axis is read when asked for. False: for random
-        access, the file is mapped into memory, or its tiles unpacked there.
+        True: each slice `[start:stop]` of the first axis is read when it is indexed. False: for
+        random access, the file is mapped into memory, or its tiles unpacked there.
     dtype : dtype
         Type of the values.
 
@@ -702,5 +707,5 @@ def open_pixels(
             hdu = hdus[image.index]
             if tuple(hdu.shape)[image.leading :] != image.shape:
                 raise ObservationError(image.path, "has changed since it was opened")
-            stored = hdu.section if in_pieces else hdu.data
-        yield Pixels(stored, image, dtype)
+            raw = hdu.section if in_pieces else hdu.data
+        yield Pixels(raw, image, dtype)

@@ -1,7 +1,7 @@
 """Numbers and units as headers have them, whatever their spelling.
 
-In: texts of header cards, such as "1.5 e-/ADU" and "electron/pixel". Out: numbers and units of
-astropy.
+Inputs: texts of header cards, such as "1.5 e-/ADU" and "electron/pixel". Outputs: numbers and units
+of astropy.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ SPELLINGS = {
 
 
 def parse_unit(text: str) -> UnitBase | None:
-    """Return the unit that a text means; None if it means none. An empty text has no dimension."""
+    """Return the unit of a text, None if it is not a unit; an empty text is dimensionless."""
     from astropy import units as u
 
     def replace_word(match: re.Match[str]) -> str:
         units = (n for n, form in SPELLINGS.items() if re.fullmatch(form, match[0], re.IGNORECASE))
         return next(units, match[0])
 
-    # Words are letters, not those of an exponent as in 1e-20; e- is one, but not in e-1.
+    # Words are letters, except the e of an exponent as in 1e-20; e- is a word, but not in e-1.
     words = re.sub(r"(?<![\d.])(?:e-(?!\d)|[a-z]+)|''|\"", replace_word, text.strip(), flags=re.I)
     with warnings.catch_warnings(), suppress(ValueError, TypeError):
         warnings.simplefilter("ignore", u.UnitsWarning)  # several slashes
@@ -45,14 +45,14 @@ def parse_unit(text: str) -> UnitBase | None:
 def count_powers(unit: UnitBase) -> dict[str, float]:
     """Return the powers of the units that a unit consists of, by their names, without "per pixel".
 
-    The pixel is that of the image: counts per pixel are counts.
+    The pixel means a pixel of the image: counts per pixel are counts.
     """
     parts = zip(unit.bases, unit.powers, strict=True)
     return {base.name: float(power) for base, power in parts if base.name != "pix"}
 
 
 def parse_number(value: object, unit: str) -> float | None:
-    """Return the number of a header card in a unit of astropy; None if it has none.
+    """Return the number of a header card in a unit of astropy; None without a number.
 
     A plain number is in this unit. A number with another unit is converted, also one of the inverse
     unit, such as ADU per electron, and one per pixel. A comma before one, two, or more than three
@@ -73,9 +73,9 @@ def parse_number(value: object, unit: str) -> float | None:
     if not isinstance(value, str) or match is None or re.search(r",\d{3}(?!\d)", match[1]):
         return None
     unit_of_text: Any = parse_unit(match[2])
-    with suppress(ValueError, TypeError, ZeroDivisionError):  # no number, or of another unit
+    with suppress(ValueError, TypeError, ZeroDivisionError):  # not a number, or of another unit
         number = float(re.sub("[dD]", "e", match[1].replace(",", ".")))
-        # "1.5" has no unit; ADU/e- is the inverse of the gain.
+        # "1.5" is without a unit; ADU/e- is the inverse of the gain.
         if unit_of_text == u.dimensionless_unscaled:
             return number
         quantity = number * unit_of_text

@@ -21,7 +21,7 @@ from psfdae.base.errors import did_you_mean, keyword
 from psfdae.base.options import Extension, File
 from psfdae.image.camera import HEADER_KEYS
 from psfdae.image.catalogue import require_sky
-from psfdae.image.containers import as_image, in_unit
+from psfdae.image.containers import as_image, to_unit
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import PlainFile
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Number: TypeAlias = float | Quantity
 else:
-    # What the command line takes in their place.
+    # Types of the command line in their place.
     StarList, Number = File, float
 
 Layer: TypeAlias = Extension | Path | np.ndarray
@@ -44,7 +44,7 @@ Layer: TypeAlias = Extension | Path | np.ndarray
 class ImageOptions:
     """Options of an image and its stars; each overrides the FITS header.
 
-    The text beside the type of a field is the help of its option, and its meaning in Python. There,
+    The text after the type of a field is the help of its option, and its meaning in Python. There,
     `catalogue` takes all that `psfdae.image.catalogue.as_catalogue` does, `detect` also the
     threshold itself, a map an array as well, and numbers may have units (`astropy.units`).
     """
@@ -124,15 +124,15 @@ class ImageKeywords(PixelKeywords, total=False):
 
 @dataclass(frozen=True)
 class ImageInput(ImageOptions):
-    """FITS file with stars, or an array, and what is stated about it.
+    """FITS file with stars, or an array, and its options.
 
     Attributes
     ----------
     image : Path, PlainFile or ndarray
         Image, or cube of stamps, of which a catalogue has a row for each.
     flux_column, background_column : str or None
-        Columns of the catalogue with fluxes inside the stamp, and with sky levels per pixel, that
-        are not to be estimated.
+        Columns of the catalogue with fluxes inside the stamp, and with sky levels per pixel, which
+        replace estimates.
     """
 
     image: Path | PlainFile | np.ndarray
@@ -146,33 +146,33 @@ class ImageInput(ImageOptions):
         check_values(type(self).__init__, vars(self), Number=float | Quantity, StarList=Any)
 
     @classmethod
-    def of(cls, image: Image, statements: Mapping[str, Any]) -> ImageInput:
-        """Return an image as Python hands it over, with what is stated about it.
+    def build(cls, image: Image, options: Mapping[str, Any]) -> ImageInput:
+        """Build the input from an image as Python hands it over, with its options.
 
         Parameters
         ----------
         image : path-like, array, NDData, HDU or HDUList
             See `psfdae.image.containers.as_image`.
-        statements : mapping
+        options : mapping
             Values by the names of this class's fields.
 
         Raises
         ------
         ObservationError
-            If it is no image, or a statement has another name.
+            If it is not an image, or an option has another name.
         """
         source = cls(as_image(image))
         names = [attribute.name for attribute in fields(cls) if attribute.name != "image"]
-        for name in statements:
+        for name in options:
             if name not in names:
                 hint = did_you_mean(name, names)
-                raise ObservationError(source.path, f"{name}: no statement on an image{hint}")
-        return replace(source, **statements)
+                raise ObservationError(source.path, f"{name}: not an option of an image{hint}")
+        return replace(source, **options)
 
     @property
     def path(self) -> Path:
-        """The image's file, or what an array is called in messages."""
-        # A temporary file has the name of what was given.
+        """The image's file, or the name of an array in messages."""
+        # A temporary file has the name of the object that was given.
         if isinstance(self.image, PlainFile):
             return self.image.name
         return self.image if isinstance(self.image, Path) else Path("array")
@@ -185,27 +185,27 @@ class ImageInput(ImageOptions):
         return suffixes.sub("", self.path.name) or "model"
 
     def files(self) -> tuple[object, ...]:
-        """Return all that is read."""
+        """Return the image, its catalogue and its maps, of any type."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance, self.error)
 
-    def of_each(self, images: Sequence[Path | PlainFile | np.ndarray]) -> list[ImageInput]:
-        """Return the same of each image; each takes the stars of a common list that are on it.
+    def repeat_for(self, images: Sequence[Path | PlainFile | np.ndarray]) -> list[ImageInput]:
+        """Return these options for each image, which takes the stars of a common list on it.
 
         Raises
         ------
         ObservationError
-            If the list of several images has no sky coordinates.
+            If the list of several images lacks sky coordinates.
         """
         # A list of several images has stars of all of them.
         on_image = self.on_image
         if self.catalogue is not None and len(images) > 1:
             require_sky(self.catalogue, "a training on several images")
             on_image = True
-        # Every image has the same statements.
+        # Every image has the same options.
         return [replace(self, image=image, on_image=on_image) for image in images]
 
     def camera(self, image_unit: str = "") -> dict[str, float | None]:
-        """Return the camera's values that are stated as plain numbers, None for the others.
+        """Return the given values of the camera as plain numbers, None for the others.
 
         Parameters
         ----------
@@ -221,19 +221,19 @@ class ImageInput(ImageOptions):
         Raises
         ------
         ObservationError
-            If a value has another unit, or is no number above 0; likewise the threshold.
+            If a value has another unit, or is not a number above 0; likewise the threshold.
         """
-        # Values with the units that they may have; the first is that of the number.
+        # Values with the units that they may have; the number is in the first one.
         units = {
             "pixel_scale_arcsec": "arcsec/pix arcsec",
             "gain": "electron/adu electron/ct electron/DN",
             "read_noise": "electron",
             "saturate": f"adu ct DN {image_unit.replace(' ', '')}",
         }
-        numbers = {k: in_unit(getattr(self, k), unit, k, self.path) for k, unit in units.items()}
-        # A count, a scale or a threshold of 0 has no meaning.
+        numbers = {k: to_unit(getattr(self, k), unit, k, self.path) for k, unit in units.items()}
+        # A count, a scale or a threshold of 0 is meaningless.
         for name, number in {**numbers, "threshold": self.detection_sigma}.items():
             if number is not None and not (math.isfinite(number) and number > 0):
-                typed = keyword(name, number)
-                raise ObservationError(self.path, f"{typed}: expected a number above 0")
+                option_text = keyword(name, number)
+                raise ObservationError(self.path, f"{option_text}: expected a number above 0")
         return dict(zip(HEADER_KEYS, numbers.values(), strict=True))

@@ -1,7 +1,7 @@
 """Interpolation of bad pixels from the good ones around them.
 
-In: an image (h, w), or stamps of stars (n, s, s), and their bad pixels. Out: a copy in which these
-have values.
+Inputs: an image (h, w), or stamps of stars (n, s, s), and their bad pixels. Output: a copy in which
+the bad pixels have values.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 
-def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image with its bad pixels interpolated, and those that have no neighbours for it.
+def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image with its bad pixels interpolated, and the bad pixels without good neighbours.
 
     Along rows and columns, a cubic polynomial goes through the two nearest pixels on each side;
     a line through the nearest ones is taken where these are bad, and else the mean of the good
@@ -19,21 +19,23 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
     Parameters
     ----------
     image : ndarray, shape (h, w)
+        Image, in any unit; it may be NaN where it is bad.
     bad : ndarray of bool, shape (h, w)
+        Pixels to replace.
 
     Returns
     -------
     image : ndarray, shape (h, w)
-        A copy; 0 where nothing is near.
+        A copy; 0 where no good pixel is near.
     remaining : ndarray of bool, shape (h, w)
         Bad pixels without a good one among the 5 × 5 around.
     """
-    filled, remaining = np.where(bad, 0.0, image), np.zeros(bad.shape, dtype=bool)
+    result, remaining = np.where(bad, 0.0, image), np.zeros(bad.shape, dtype=bool)
     row, column = np.nonzero(bad)
     if not row.size:
-        return filled, remaining
+        return result, remaining
     reach = 2
-    padded, good = np.pad(filled, reach), np.pad(~bad, reach)
+    wide_image, good = np.pad(result, reach), np.pad(~bad, reach)
     # Gaussian mean of the good pixels around, Σ w v / Σ w.
     steps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
@@ -43,30 +45,30 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
             at = row + reach + down, column + reach + across
             weight = weights[down + reach, across + reach] * good[at]
             # Sums over the pixels that are down and across by these steps.
-            mean += weight * padded[at]
+            mean += weight * wide_image[at]
             weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
     for axis in (np.array([1, 0]), np.array([0, 1])):
         places = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
-        values, is_good = [padded[at] for at in places], [good[at] for at in places]
+        values, is_good = [wide_image[at] for at in places], [good[at] for at in places]
         has_line = is_good[1] & is_good[2]
         has_cubic = has_line & is_good[0] & is_good[3]
         line = 0.5 * (values[1] + values[2])
         # Cubic through −2, −1, 1, 2 at 0: (4 (v₋₁ + v₁) − v₋₂ − v₂) / 6; line: (v₋₁ + v₁) / 2.
         cubic = (4.0 * (values[1] + values[2]) - values[0] - values[3]) / 6.0
-        # A cubic counts twice as much as a line, which cuts off peaks.
+        # A cubic has twice the weight of a line, which cuts off peaks.
         part = np.where(has_cubic, 2.0, has_line * 1.0)
         total += part * np.where(has_cubic, cubic, line)
         count += part
     mean = mean / np.where(weight_sum > 0, weight_sum, 1.0)
     # A pixel without a good pair on either axis gets the Gaussian mean.
-    filled[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
+    result[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
     remaining[row, column] = weight_sum <= 0
-    return filled, remaining
+    return result, remaining
 
 
-def interpolated_stamps(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return stamps (n, s, s) with their bad pixels `interpolated`, each from its own pixels."""
+def fill_bad_stamps(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return stamps (n, s, s) with their bad pixels filled, each from its own pixels."""
     rows = np.flatnonzero(bad.any(axis=(1, 2)))
     if not rows.size:
         return stamps
@@ -75,6 +77,6 @@ def interpolated_stamps(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
     side = stamps.shape[-1]
     tall = np.pad(stamps[rows], between).reshape(-1, side)
     tall_bad = np.pad(bad[rows], between, constant_values=True).reshape(-1, side)
-    filled = np.array(stamps)
-    filled[rows] = interpolated(tall, tall_bad)[0].reshape(len(rows), side + 2, side)[:, :side]
-    return filled
+    result = np.array(stamps)
+    result[rows] = fill_bad(tall, tall_bad)[0].reshape(len(rows), side + 2, side)[:, :side]
+    return result

@@ -1,8 +1,8 @@
-"""Mask and map of noise of an image, and what its pixels are by them.
+"""Mask and noise map of an image, and its bad pixels, noise and sky computed from them.
 
-The statements on an image go in, and `find_layers` finds what they name, or what the image's own
-file has beside it: extensions such as DQ and ERR. Out come `Layers`: the image, which of its pixels
-are bad, their σ, and the sky.
+Inputs: the options of an image. `find_layers` finds the mask and the noise map that they name, or
+the extensions of the image's own file such as DQ and ERR. Output: `Layers`: the image, its bad
+pixels, their σ, and the sky.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from psfdae.base.errors import keyword
 from psfdae.base.progress import task
 from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
 from psfdae.image.camera import CameraValue
-from psfdae.image.detection import Sky, sky_of
+from psfdae.image.detection import Sky, find_sky
 from psfdae.image.errors import ObservationError, reading, silent
 from psfdae.image.fits_file import (
     SCIENCE,
@@ -39,7 +39,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.trails import add_trails
 
 NOISE_MAPS = {"weight": "a weight map", "variance": "a variance map", "error": "a map of σ"}
-"""Words for the kinds of maps of noise: 1/σ² but for a factor, σ², σ."""
+"""Words for the kinds of noise maps: 1/σ² but for a factor, σ², σ."""
 
 POWER_OF_SIGMA = {"weight": -2, "variance": 2, "error": 1}
 """Powers of σ that these maps have."""
@@ -52,6 +52,7 @@ class NoiseMap:
     Attributes
     ----------
     image : ImageFile
+        The map itself.
     kind : str
         A key of `NOISE_MAPS`.
     scale : float
@@ -66,9 +67,9 @@ class NoiseMap:
     photons: float = 0.0
 
     def sigma(self, values: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return σ of the sky in pixels from their values in the map, NaN where it has none.
+        """Return σ of the sky in pixels from their values in the map, NaN where one is missing.
 
-        The photons of stars, `light` above the sky, are taken out of a map that has them.
+        The photons of stars, `light` above the sky, are taken out of a map that includes them.
 
         Parameters
         ----------
@@ -88,15 +89,18 @@ class NoiseMap:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """Image with its mask and map of noise, and how they are read.
+    """Image with its mask and noise map, which it opens and reads.
 
     Attributes
     ----------
     image : ImageFile
+        The image.
     mask : ImageFile or None
+        Its mask.
     bad_bits : int or None
         Bits of the mask that are bad; None for all.
     noise : NoiseMap or None
+        Its noise map.
     least_noise : float
         Read noise in the unit of the pixels; 0 where it or the gain is not known.
     saturate : float or None
@@ -114,7 +118,7 @@ class Layers:
 
     @contextmanager
     def open(self, in_pieces: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
-        """Yield the pixels of image, mask and map of noise, None for what there is not.
+        """Yield the pixels of image, mask and noise map, None for a missing one.
 
         Parameters
         ----------
@@ -123,17 +127,17 @@ class Layers:
         """
         with ExitStack() as files:
 
-            def pixels_of(image: ImageFile, dtype: type[np.floating] = np.float32) -> Pixels:
+            def open_layer(image: ImageFile, dtype: type[np.floating] = np.float32) -> Pixels:
                 return files.enter_context(open_pixels(image, in_pieces=in_pieces, dtype=dtype))
 
-            pixels = pixels_of(self.image)
+            pixels = open_layer(self.image)
             # Bits of whole numbers do not fit into the mantissa of a float32.
-            mask = None if self.mask is None else pixels_of(self.mask, np.float64)
-            noise = None if self.noise is None else pixels_of(self.noise.image)
+            mask = None if self.mask is None else open_layer(self.mask, np.float64)
+            noise = None if self.noise is None else open_layer(self.noise.image)
             yield pixels, mask, noise
 
     def is_bad(self, values: np.ndarray) -> np.ndarray:
-        """Return True for the values of the mask that are bad; those that are no number are.
+        """Return True for the values of the mask that are bad; NaN is bad.
 
         Parameters
         ----------
@@ -142,7 +146,7 @@ class Layers:
         """
         if self.bad_bits is None:
             return np.asarray(values != 0)
-        with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
+        with np.errstate(invalid="ignore"):  # infinity does not have bits
             return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
 
     def sky(self) -> Sky:
@@ -166,28 +170,28 @@ class Layers:
         # Pixels without a number, of the mask, or without noise in its map are masked.
         with self.open(in_pieces=False) as (pixels, mask, noise):
             image = pixels[:]
-            masked = ~np.isfinite(image)
+            bad = ~np.isfinite(image)
             if mask is not None:
-                masked |= self.is_bad(mask[:])
+                bad |= self.is_bad(mask[:])
             if noise is not None and self.noise is not None:
                 sigma = replace(self.noise, photons=0.0).sigma(noise[:])
-                masked |= np.isnan(sigma)
-        return image, masked, sigma
+                bad |= np.isnan(sigma)
+        return image, bad, sigma
 
-    def find_bad(self, image: np.ndarray, masked: np.ndarray) -> BadPixels:
-        """Search for bad pixels in what `read` returns, once.
+    def find_bad(self, image: np.ndarray, bad: np.ndarray) -> BadPixels:
+        """Search for bad pixels, once, in the image and the mask that `read` returns.
 
         Raises
         ------
         ObservationError
-            If the sky of the image was clipped at its least value.
+            If the sky of the image is clipped at its minimum value.
         """
         if not self._bad_pixels:
             try:
                 with silent():
                     # In the unit of the file, which messages have.
                     unit, saturate = self.image.unit_factor, self.saturate
-                    bad_pixels = find_bad_pixels(image / unit, masked, self.image.headers, saturate)
+                    bad_pixels = find_bad_pixels(image / unit, bad, self.image.headers, saturate)
                     limit = None if saturate is None else saturate * unit
                     self._bad_pixels.append(add_trails(image, bad_pixels, limit))
             except ClippedSkyError as error:
@@ -197,16 +201,16 @@ class Layers:
 
 @lru_cache(maxsize=1)
 def _sky(layers: Layers) -> Sky:
-    """Return the image of layers with its sky; that of the last ones is kept for more calls."""
+    """Return the image of layers with its sky; the last one is kept for more calls."""
     # The sky is measured without bad pixels, in units of the map of σ if there is one.
-    image, masked, sigma = layers.read()
+    image, bad, sigma = layers.read()
     with task("sky", 2) as advance, silent():
-        bad_pixels = layers.find_bad(image, masked)
+        bad_pixels = layers.find_bad(image, bad)
         advance(1, "bad pixels")
         # A sky that was measured to find trails is used once: it takes much memory.
         layers._bad_pixels[:] = [replace(bad_pixels, sky=None)]
         try:
-            sky = sky_of(image, bad_pixels.mask, sigma, layers.least_noise, bad_pixels.sky)
+            sky = find_sky(image, bad_pixels.mask, sigma, layers.least_noise, bad_pixels.sky)
         except ValueError:  # nothing to measure the sky on
             problem = "too few pixels of the image have a value that is not masked"
             if layers.mask is not None and layers.bad_bits is None:
@@ -221,64 +225,67 @@ def _sky(layers: Layers) -> Sky:
     with layers.open(in_pieces=False) as (_, _, noise):
         assert noise is not None
         sigma = sky.noise_scale * layers.noise.sigma(noise[:], sky.flat)
-    # Bad pixels, of which the map has no σ, keep the noise of the sky around.
+    # Bad pixels, for which the map lacks σ, keep the noise of the sky around.
     return replace(sky, noise=np.where(np.isfinite(sigma), sigma, sky.noise).astype(np.float32))
 
 
 def find_layers(
     source: ImageInput, image: ImageFile, is_cube: bool, camera: dict[str, CameraValue]
 ) -> tuple[Layers, list[str]]:
-    """Find mask and map of noise of an image, those that are stated or those of its own file.
+    """Find mask and noise map of an image: the given ones, or the layers of its own file.
 
     Parameters
     ----------
     source : ImageInput
-        What is stated of them.
+        Options of the image, which may name the layers.
     image : ImageFile
+        The image.
     is_cube : bool
         The image is a cube of stamps, of which the file's other extensions are not used.
     camera : dict of str to CameraValue
+        Values of the camera, by the names of `HEADER_KEYS`.
 
     Returns
     -------
     layers : Layers
+        Image, mask and noise map.
     remarks : list of str
-        Sentences on what is used of the image's own file.
+        Sentences on the layers of the image's own file that are used.
 
     Raises
     ------
     ObservationError
-        If a layer cannot be found, or is not as large as the image; or if statements exclude each
+        If a layer cannot be found, or is not as large as the image; or if options exclude each
         other.
     """
     # The mask, and the noise of the electronics in counts: read noise / gain.
     factor = image.unit_factor
-    layers_of_file = {} if is_cube else layers_beside(image)
-    mask, bad_bits, remarks = mask_and_bits(source, image, layers_of_file.get("mask"))
+    layers_of_file = {} if is_cube else find_file_layers(image)
+    mask, bad_bits, remarks = find_mask(source, image, layers_of_file.get("mask"))
     gain, read_noise = camera["gain"].value, camera["read noise"].value
     least_noise = factor * read_noise / gain if read_noise and gain else 0.0
     saturate = camera["saturation"].value
     layers = Layers(image, mask, bad_bits, least_noise=least_noise, saturate=saturate)
-    # The map of noise: one that is stated, else that of the file, if nothing is.
+    # The noise map: the given one; else, if none is given, the file's own.
     maps = {kind: getattr(source, kind) for kind in NOISE_MAPS}
-    stated = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
-    if len(stated) > 1 or (stated and is_cube):
+    given_maps = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
+    if len(given_maps) > 1 or (given_maps and is_cube):
         raise ObservationError(
             source.path,
             "an image takes one map of weight, variance or error, a cube of stamps none",
         )
     notes = [f"{mask.label} as mask"] if mask is not None and source.mask is None else []
-    for kind, place in stated.items():
-        noise = _layer_of(image, place, NOISE_MAPS[kind]).times(factor ** POWER_OF_SIGMA[kind])
-        # A pixel of σ or weight 0 has no data; the map is checked at the same time.
+    for kind, place in given_maps.items():
+        noise = _find_layer(image, place, NOISE_MAPS[kind]).times(factor ** POWER_OF_SIGMA[kind])
+        # A pixel of σ or weight 0 is without data; the map is checked at the same time.
         if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
         layers = replace(layers, noise=NoiseMap(noise, kind))
-    # Without a statement, the map of the image's own file.
+    # Without an option, the map of the image's own file.
     if all(place is None for place in maps.values()):
         for kind in layers_of_file.keys() & NOISE_MAPS.keys():
-            of_file = layers_of_file[kind].times(factor ** POWER_OF_SIGMA[kind])
-            noise_map, note = noise_of_file(of_file, kind)
+            file_map = layers_of_file[kind].times(factor ** POWER_OF_SIGMA[kind])
+            noise_map, note = check_noise_map(file_map, kind)
             layers, notes = replace(layers, noise=noise_map), [note, *notes]
     if notes:
         line = f"{source.path}: uses {' and '.join(notes)}"
@@ -295,18 +302,19 @@ def find_layers(
     return layers, remarks
 
 
-def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
-    """Return the map of noise of the image's own file, and words on its use.
+def check_noise_map(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
+    """Check the noise map of the image's own file; return it, and words on its use.
 
-    In it 0 is for bad pixels. None if it has values for fewer than half of the pixels.
+    Its bad pixels are 0. None if it has values for fewer than half of the pixels.
 
     Returns
     -------
     noise_map : NoiseMap or None
+        The map, if it is used.
     words : str
-        What the map is used as, or why it is not.
+        Use of the map, or the reason why it is not used.
     """
-    # Part of the pixels that have a σ or σ² above 0.
+    # Fraction of the pixels that have a σ or σ² above 0.
     with open_pixels(noise, in_pieces=False) as pixels:
         has_value = np.nan_to_num(pixels[:], posinf=0.0) > 0
     share, bad_count = float(has_value.mean()), int(np.count_nonzero(~has_value))
@@ -316,30 +324,31 @@ def noise_of_file(noise: ImageFile, kind: str) -> tuple[NoiseMap | None, str]:
     return NoiseMap(noise, kind), words + (f" (bad pixels: {bad_count})" if bad_count else "")
 
 
-def mask_and_bits(
+def find_mask(
     source: ImageInput, image: ImageFile, mask: ImageFile | None
 ) -> tuple[ImageFile | None, int | None, list[str]]:
-    """Return the mask that is stated, else that of the image's file, its bad bits, and remarks.
+    """Find the given mask, else the mask of the image's file, its bad bits, and remarks.
 
     Parameters
     ----------
     source : ImageInput
-        Statements on the image; its `mask` may be "none".
+        Options of the image; its `mask` may be "none".
     image : ImageFile
+        The image.
     mask : ImageFile or None
-        Mask that the image's own file has beside it.
+        Mask in the image's own file.
 
     Raises
     ------
     ObservationError
-        If bits are stated, but there is no mask.
+        If bits are given without a mask.
     """
     if source.mask is not None:
-        mask = None if _is_none(source.mask) else _layer_of(image, source.mask, "a mask")
+        mask = None if _is_none(source.mask) else _find_layer(image, source.mask, "a mask")
     if mask is None and source.bad_bits is not None:
         raise ObservationError(source.path, f"{keyword('bad_bits')} needs a mask that has bits")
-    # Bits that are stated go before those by the header.
-    bits_of_header = None if mask is None else bits_of_bad_pixels(mask)
+    # Given bits override the header's.
+    bits_of_header = None if mask is None else find_bad_bits(mask)
     if mask is None or source.bad_bits is not None or bits_of_header is None:
         return mask, source.bad_bits, []
     bits, planes = bits_of_header
@@ -348,16 +357,17 @@ def mask_and_bits(
 
 
 def _is_none(place: object) -> bool:
-    """Return True for the word that takes no layer, not even that of the image's file."""
+    """Return True for the word "none", which excludes all layers, the image file's own included."""
     return isinstance(place, str) and place.strip().lower() == "none"
 
 
-def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
-    """Return a layer that is stated, with a pixel for every one of the image, or of its stamps.
+def _find_layer(image: ImageFile, place: Any, role: str) -> ImageFile:
+    """Find a given layer, with a pixel for every one of the image, or of its stamps.
 
     Parameters
     ----------
     image : ImageFile
+        The image.
     place : str, int, Path or ndarray
         Extension of the image's file, another file, or an array.
     role : str
@@ -370,7 +380,7 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
     """
     # An array, the path of a file, or else an extension; a text may be either of these two.
     is_array = isinstance(place, np.ndarray)
-    # A name that is no file is an extension's; a pipe is refused when it is opened.
+    # A name that is not a file is an extension's; a pipe is rejected when it is opened.
     is_name = isinstance(place, str) and (Path(place).is_dir() or not Path(place).exists())
     is_file = isinstance(place, str | Path) and not is_name
     if image.values is not None and not (is_array or is_file):
@@ -385,18 +395,18 @@ def _layer_of(image: ImageFile, place: Any, role: str) -> ImageFile:
         layer = layer.one_plane()
     # All stamps of a cube may share the mask of one.
     if layer.shape != shape and not (len(shape) == 3 and layer.shape == shape[1:]):
-        size, expected = ("×".join(map(str, s)) for s in (layer.shape, shape))
-        raise ObservationError(layer.path, f"{role} of {size} pixels, expected {expected}")
+        size, expected_size = ("×".join(map(str, s)) for s in (layer.shape, shape))
+        raise ObservationError(layer.path, f"{role} of {size} pixels, expected {expected_size}")
     return layer
 
 
 def count_zeros(noise: ImageFile, kind: str) -> int:
-    """Return the number of pixels in which a noise map of the user is 0: these have no data.
+    """Return the number of pixels in which a noise map of the user is 0, which means no data.
 
     Raises
     ------
     ObservationError
-        If its name says another kind, or it has values that no map of its kind has.
+        If its name means another kind, or it has values that no map of its kind has.
     """
     # A map under the name of another kind would give wrong errors without a word.
     kind_by_name = map_kind(noise)
@@ -410,7 +420,7 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
         values = pixels[:]
     # Values that no σ², 1/σ² or σ has.
     negative, zeros = int(np.count_nonzero(values < 0)), int(np.count_nonzero(values == 0))
-    # SWarp and SExtractor write 0 where there are no data; other programs NaN or infinity.
+    # SWarp and SExtractor write 0 where data are missing; other programs NaN or infinity.
     if negative:
         raise ObservationError(
             noise.path,
@@ -424,27 +434,29 @@ def count_zeros(noise: ImageFile, kind: str) -> int:
     return zeros
 
 
-def with_photons(
+def add_photon_noise(
     layers: Layers, camera: dict[str, CameraValue], sky: Sky
 ) -> tuple[Layers, dict[str, CameraValue], list[str]]:
-    """Return layers that know how the map of noise grows with the light of stars.
+    """Add the growth of the noise map with the light of stars to layers.
 
-    Where photons make the noise, variance = variance of the sky + light / gain. A map of the sky
-    alone does not grow, and nothing changes.
+    Where photons dominate the noise, variance = variance of the sky + light / gain. A map of the
+    sky alone does not grow, and nothing changes.
 
     Parameters
     ----------
     layers : Layers
-        With a map of noise.
+        Layers with a noise map.
     camera : dict of str to CameraValue
+        Values of the camera, by the names of `HEADER_KEYS`.
     sky : Sky
         The image without its sky.
 
     Returns
     -------
     layers : Layers
+        Layers whose noise map has `photons`, if it grows.
     camera : dict of str to CameraValue
-        With the gain that the map shows, if it is not known otherwise.
+        Values of the camera, with the gain that the map shows, if it is not known otherwise.
     remarks : list of str
         A sentence on this gain.
     """
@@ -480,10 +492,10 @@ def with_photons(
     return layers, camera | {"gain": CameraValue(gain, label)}, [words]
 
 
-def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
-    """Find the mask and the map of noise that a file has for an image, by their names.
+def find_file_layers(image: ImageFile) -> dict[str, ImageFile]:
+    """Find the mask and the noise map that a file has for an image, by their names.
 
-    They have its size. If names repeat, their versions (EXTVER) belong together; of a file with
+    They have its size. If names repeat, their versions (EXTVER) belong together; in a file with
     several science images that do not, none is taken.
 
     Returns
@@ -494,14 +506,14 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
     if image.values is not None:
         return {}
     with reading(image.path), open_hdus(image.file) as hdus:
-        # Layers belong to a science image if it is the only one, or that of a pipeline.
+        # Layers belong to a science image if it is the only one, or named as in pipelines.
         images = [(k, hdu) for k, hdu in enumerate(hdus) if has_pixels(hdu)]
         science_hdu = hdus[image.index]
         science_count = sum(is_science(hdu.name) for _, hdu in images)
         of_pipeline = science_hdu.name.upper() in SCIENCE
         if not is_science(science_hdu.name) or (science_count > 1 and not of_pipeline):
             return {}
-        # Layers of its size and version, whose name is no part of another, such as VAR_POISSON.
+        # Layers of its size and version, whose name does not mean a part, such as VAR_POISSON.
         maps = [(k, hdu) for k, hdu in images if not is_science(hdu.name) and "_" not in hdu.name]
         maps = [(k, hdu) for k, hdu in maps if hdu.ver == science_hdu.ver]
         places = [k for k, hdu in maps if tuple(hdu.shape)[-2:] == image.shape[-2:]]
@@ -514,13 +526,13 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
         kind = map_kind(layer)
         if layer.shape == image.shape and kind is not None:
             layers.setdefault(kind, layer)
-    # A standard deviation goes before a variance; weights have no unit that could be trusted.
+    # A standard deviation overrides a variance; the unit of weights cannot be trusted.
     names = ("mask", "error" if "error" in layers else "variance")
     return {name: layers[name] for name in names if name in layers}
 
 
 def map_kind(image: ImageFile) -> str | None:
-    """Return which map an extension is by its name and UTYPE, None if neither says it.
+    """Return the kind of map of an extension by its name and UTYPE, None if neither shows it.
 
     CCDData has its uncertainty in an extension UNCERT, and its kind in UTYPE.
     """
@@ -532,11 +544,11 @@ def map_kind(image: ImageFile) -> str | None:
     return types.get(str(image.card("UTYPE") or "STD").strip().upper(), kind)
 
 
-def bits_of_bad_pixels(mask: ImageFile) -> tuple[int, str] | None:
-    """Return the sum of the mask's bits that are bad by its header, and who says so.
+def find_bad_bits(mask: ImageFile) -> tuple[int, str] | None:
+    """Find the sum of the mask's bits that are bad by its header, and their names.
 
-    None if the header does not say it. LSST names its planes (MP_BAD = 0 for bit 0); JWST's and
-    Roman's bit 1 is DO_NOT_USE.
+    None if the header does not define them. LSST names its planes (MP_BAD = 0 for bit 0); JWST's
+    and Roman's bit 1 is DO_NOT_USE.
     """
     # Planes of LSST of which the pixels show no light of stars; others mark good pixels.
     lsst_planes = ("BAD", "SAT", "INTRP", "CR", "NO_DATA", "UNMASKEDNAN")

@@ -1,6 +1,6 @@
 """Star lists in files: FITS tables and LDAC, text, VOTable, Parquet, DAOPHOT, DS9, VizieR.
 
-In: a file. Out: its table as astropy has it, a row for each star in the order of the file.
+Input: a file. Output: its table in astropy's form, a row for each star in the order of the file.
 
 The format follows from the content. astropy and pyarrow read all tables; only the regions of DS9
 are read here.
@@ -32,7 +32,7 @@ from psfdae.image.fits_file import (
 from psfdae.image.position_columns import find_identifier, has_positions
 
 COLUMNS_MAX = 2000
-"""Largest number of columns of a list that is text; LSST's have 1300."""
+"""Maximum number of columns of a text list; LSST's have 1300."""
 
 
 def read_list_table(path: Path) -> Table:
@@ -41,6 +41,7 @@ def read_list_table(path: Path) -> Table:
     Parameters
     ----------
     path : Path
+        File of any of the formats, which may be compressed.
 
     Returns
     -------
@@ -52,12 +53,12 @@ def read_list_table(path: Path) -> Table:
     ObservationError
         If the file is missing, damaged, or of none of the formats.
     """
-    # A FITS file or a Parquet file; of text, the first line that is not blank tells the format.
+    # A FITS file or a Parquet file; for text, the first line that is not blank shows the format.
     file, start = unpack_file(path)
     if start.startswith(b"SIMPLE  ="):
-        return fits_table(file)
+        return read_fits_table(file)
     if start.startswith(b"PAR1\x15"):  # PAR1 alone could be the name of a column
-        return parquet_table(file)
+        return read_parquet_table(file)
     with reading(path):
         content = file.path.read_bytes()
     # Text may begin with a mark of its encoding; a byte 0 is in no text.
@@ -73,18 +74,18 @@ def read_list_table(path: Path) -> Table:
     if not lines:
         raise ObservationError(path, "the catalogue is empty")
     if lines[0].startswith("# Region file") or path.suffix.lower() == ".reg":
-        return regions(path, lines)
+        return read_regions(path, lines)
     if lines[0].lstrip().startswith("<"):
-        return votable(path, content)
+        return read_votable(path, content)
     # A list of DAOPHOT itself (Stetson 1987, PASP 99, 191) begins with number, x and y. Its pixels
     # count from 1, as SExtractor's do. Two of its three head lines are not blank.
     if re.match(r"\s*+NL\s++NX\s++NY\b", lines[0]):
         rows = (" ".join(line.split()[:3]) for line in lines[2:])
         lines = ["id X_IMAGE Y_IMAGE", *rows]
-    return text_table(path, lines)
+    return read_text_table(path, lines)
 
 
-def fits_table(file: PlainFile) -> Table:
+def read_fits_table(file: PlainFile) -> Table:
     """Read the LDAC_OBJECTS or the only table of a FITS file; columns stay in the file till used.
 
     Parameters
@@ -120,7 +121,7 @@ def fits_table(file: PlainFile) -> Table:
         return Table.read(objects[0], format="fits", mask_invalid=False, unit_parse_strict="silent")
 
 
-def parquet_table(file: PlainFile) -> Table:
+def read_parquet_table(file: PlainFile) -> Table:
     """Read the columns of a Parquet file of which each row is a star.
 
     Parameters
@@ -150,7 +151,7 @@ def parquet_table(file: PlainFile) -> Table:
         return Table.from_pandas(rows.to_pandas())
 
 
-def text_table(path: Path, lines: Sequence[str]) -> Table:
+def read_text_table(path: Path, lines: Sequence[str]) -> Table:
     """Read a text table from the lines of a file that are not blank.
 
     Parameters
@@ -158,18 +159,19 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
     path : Path
         The file, for messages.
     lines : sequence of str
+        Lines that are not blank.
 
     Raises
     ------
     ObservationError
-        If there is no row of a star, or no names of columns, or the text is no table.
+        If a row of a star or the names of columns are missing, or the text is not a table.
     """
     from astropy.io import ascii as text_tables
 
     head = "\n".join(line[:1000] for line in lines[:200])
     names = (name for name, form in TEXT_FORMATS.items() if re.match(form, head, re.MULTILINE))
     options = {"format": next(names, "basic")}
-    if options["format"] == "basic" and (lines := plain_rows(lines)):
+    if options["format"] == "basic" and (lines := select_rows(lines)):
         # The first mark that the line of names has; of tabs, the first name may be blank.
         options["delimiter"] = next((mark for mark in ",;\t" if mark in lines[0]), " ")
         if lines[0].lstrip(" ").startswith("\t"):
@@ -187,22 +189,20 @@ def text_table(path: Path, lines: Sequence[str]) -> Table:
         if max(len(words), *map(len, words)) > COLUMNS_MAX:
             raise ObservationError(path, f"more than {COLUMNS_MAX} columns, or letters in a name")
     with reading(path):
-        # The line break at the end is what tells a table from the name of a file.
+        # The line break at the end distinguishes a table from the name of a file.
         table = text_tables.read("\n".join(lines) + "\n", guess=False, **options)
-        return with_texts_of_identifiers(table, lines, options)
+        return keep_identifier_texts(table, lines, options)
 
 
-def with_texts_of_identifiers(
-    table: Table, lines: Sequence[str], options: Mapping[str, Any]
-) -> Table:
-    """Return a text table with its identifiers as they are written: 001 is not 1, nor 1e5 100000.0.
+def keep_identifier_texts(table: Table, lines: Sequence[str], options: Mapping[str, Any]) -> Table:
+    """Keep the identifiers of a text table as they are written: 001 is not 1, nor 1e5 100000.0.
 
     Parameters
     ----------
     table : Table
         The table as astropy reads it.
     lines : sequence of str
-        Its lines.
+        Lines of the table.
     options : mapping
         Options with which astropy reads them.
     """
@@ -238,25 +238,25 @@ table is "basic"."""
 
 
 def has_mostly_numbers(row: str) -> bool:
-    """Return whether most words of a row of a text table are numbers, or sexagesimal angles."""
+    """Return True if most words of a row of a text table are numbers, or sexagesimal angles."""
     words = re.split(r"[,;|\s]+", row.strip())
     form = re.compile(r"[-+.:\d]++(?:[eE][-+]?\d++)?")
     return 2 * sum(form.fullmatch(word) is not None for word in words) > len(words)
 
 
-def plain_rows(lines: Sequence[str]) -> Sequence[str]:
-    """Return the rows of a text table, the names of its columns first, without comments.
+def select_rows(lines: Sequence[str]) -> Sequence[str]:
+    """Select the rows of a text table, the names of its columns first, without comments.
 
-    A comment above numbers without names is the names if it has as many words as the numbers'
-    first row: of several ones, the last with names of positions, or else the last. VizieR writes
-    two lines of units and of dashes below the names, which are left out.
+    A comment above numbers without names gives the names if it has as many words as the numbers'
+    first row: of several comments, the last with names of positions, or else the last. VizieR
+    writes two lines of units and of dashes below the names, which are left out.
 
     Parameters
     ----------
     lines : sequence of str
         Lines that are not blank.
     """
-    # Rows that are no comments, and the comments above the first of them.
+    # Rows that are not comments, and the comments above the first row.
     rows = [line for line in lines if not line.lstrip().startswith("#")]
     if not rows:
         return []
@@ -265,16 +265,16 @@ def plain_rows(lines: Sequence[str]) -> Sequence[str]:
         mark = next((mark for mark in ",;\t" if mark in rows[0]), None)
         texts = [line.lstrip("# \t") for line in reversed(preamble[-50:])]
         names = [text for text in texts if len(text.split(mark)) == len(rows[0].split(mark))]
-        best = max(names, key=lambda text: has_positions(text.split(mark)), default=None)
-        return rows if best is None else [best, *rows]
+        header_row = max(names, key=lambda text: has_positions(text.split(mark)), default=None)
+        return rows if header_row is None else [header_row, *rows]
     has_dashes = len(rows) > 2 and "--" in rows[2] and not rows[2].strip("-\t;|, ")
     return [rows[0], *rows[3:]] if has_dashes else rows
 
 
-def votable(path: Path, content: bytes) -> Table:
+def read_votable(path: Path, content: bytes) -> Table:
     """Read the only table with rows of a VOTable.
 
-    Data that lie elsewhere are refused: astropy would open any address that a file names.
+    Data outside the file are rejected: astropy would open any address that a file names.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def votable(path: Path, content: bytes) -> Table:
     Raises
     ------
     ObservationError
-        If its data lie elsewhere, or not exactly one table has rows.
+        If its data lie outside the file, or not exactly one table has rows.
     """
     from astropy.io.votable import parse
     from astropy.utils.xml.iterparser import get_xml_iterator
@@ -314,7 +314,7 @@ def votable(path: Path, content: bytes) -> Table:
     return tables[0]
 
 
-def regions(path: Path, lines: Sequence[str]) -> Table:
+def read_regions(path: Path, lines: Sequence[str]) -> Table:
     """Read the centres of DS9's circles, points, ellipses, boxes and annuli.
 
     Parameters
@@ -333,8 +333,7 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     Raises
     ------
     ObservationError
-        If there is a region without a centre, or coordinates are not all of one system
-        that is known.
+        If a region lacks a centre, or the coordinates are not all of one known system.
     """
     from astropy.table import Table
 
@@ -359,14 +358,14 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
             continue
         # Behind the # stand text, colour and the like.
         body, _, properties = line.partition("#")
-        # Coordinates hold for what follows, or stand before a shape: "fk5; circle(…)".
+        # A system holds for the shapes that follow, or stands before a shape: "fk5; circle(…)".
         for part in filter(None, map(str.strip, body.split(";"))):
             if part.lower() in other_systems | systems_known.keys():
                 system = part.lower()
                 continue
             region = form.match(part)
             shape = region[2].lower() if region else part[:20]
-            # A polygon or a line has no centre.
+            # A polygon or a line does not have a centre.
             if region is None or shape not in shapes:
                 raise ObservationError(
                     path, f"region {shape!r}, expected one of {', '.join(shapes)}"
@@ -381,10 +380,10 @@ def regions(path: Path, lines: Sequence[str]) -> Table:
     if len(systems) > 1 or not systems <= systems_known.keys():
         raise ObservationError(
             path,
-            f"regions in coordinates {', '.join(sorted(s or 'not stated' for s in systems))}; "
+            f"regions in coordinates {', '.join(sorted(s or 'not given' for s in systems))}; "
             f"expected one of {', '.join(systems_known)}: save them so in DS9",
         )
-    # No region at all is an empty list, of which the caller says so.
+    # Without any region the list is empty, which the caller reports.
     names = systems_known[systems.pop() if systems else "image"]
     table = Table(rows=centres or None, names=names, dtype=["U40", "U40"])
     if labels and all(labels):

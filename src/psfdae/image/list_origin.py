@@ -1,6 +1,7 @@
 """Whether a star list counts pixels from 0 or from 1, found from the stars of the image.
 
-In: an image without its sky and the positions of a list. Out: the origin, if the stars say it.
+Inputs: an image without its sky and the positions of a list. Output: the origin, if the stars show
+it.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ TOLERANCE_PX = 0.1
 errors must be below half of it."""
 
 
-def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.ndarray, int] | None:
-    """Return whether positions count from 0 or 1, where the stars of an image say it clearly.
+def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.ndarray, int] | None:
+    """Find whether positions count from 0 or 1, where the stars of an image show it clearly.
 
     The centroids of the brighter stars lie at the positions of the list, less its origin. Both
     axes must agree within 0.1 px, with standard errors below 0.05 px. None if too few stars can be
@@ -27,14 +28,15 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     ----------
     sky : Sky
         Image less its sky (`flat`), noise per pixel (`noise`) and bad pixels (`bad`).
-    listed : ndarray, shape (n, 2)
+    xy_px : ndarray, shape (n, 2)
         Positions x, y in px as the list has them, from 0 or from 1.
     fewest : int
-        Smallest number of usable stars.
+        Minimum number of usable stars.
 
     Returns
     -------
     origin : int
+        Index of the first pixel's centre, 0 or 1.
     offset : ndarray, shape (2,)
         Median of centroid − listed position, x and y in px.
     count : int
@@ -43,10 +45,10 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     # Stamps of 13 × 13 px about the position for an origin of 0.5: the centroids start midway,
     # which favours neither origin. Stars whose stamp crosses the image's edge are left out.
     shape = sky.flat.shape
-    x, y = (listed - 0.5).T
+    x, y = (xy_px - 0.5).T
     crosses_edge = cut_image(sky.bad, shape, x, y, stamp_px=13, margin=0)[2]
-    listed = listed[~crosses_edge]
-    x, y = (listed - 0.5).T
+    xy_px = xy_px[~crosses_edge]
+    x, y = (xy_px - 0.5).T
     layers = sky.flat, sky.noise, sky.bad
     stamps, noise, bad = (cut_image(v, shape, x, y, stamp_px=13, margin=0)[0] for v in layers)
     # Stars whose inner 5 × 5 pixels are good and stand 20 σ above the sky, the brightest 500.
@@ -61,7 +63,7 @@ def origin_of(sky: Sky, listed: np.ndarray, fewest: int = 8) -> tuple[int, np.nd
     # centre.
     start, window_px = np.zeros((len(star), 2)), np.full(len(star), 1.5)
     centre = find_centroids(stamps[star], start, window_px, rounds=10, reach_px=2.0)[:, ::-1]
-    offset = central_pixel(listed[star] - 0.5) + centre - listed[star]
+    offset = central_pixel(xy_px[star] - 0.5) + centre - xy_px[star]
     offset = offset[(np.abs(centre) < 1.9).all(axis=1)]
     if len(offset) < fewest:
         return None

@@ -292,7 +292,7 @@ class Observation:
         with silent():
             column, row = central_pixel(self.positions.T)
             # 2 σ above the sky is a source.
-            hits = int(sky.covered(column, row, 2.0).sum())
+            hits = int(sky.is_on_source(column, row, 2.0).sum())
         if hits < 0.5 * indices.size:
             raise ObservationError(
                 self.catalogue,

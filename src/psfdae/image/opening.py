@@ -19,7 +19,7 @@ from psfdae.base.progress import task
 from psfdae.image.camera import (
     LARGEST_STAMP_PX,
     camera_values,
-    checked_camera,
+    check_camera,
     refuse_colours,
     sky_coordinate_remarks,
     unread_card_remarks,
@@ -29,7 +29,7 @@ from psfdae.image.detection import Sky
 from psfdae.image.errors import ObservationError, shorten, silent
 from psfdae.image.fits_file import ImageFile, find_image
 from psfdae.image.image_input import ImageInput
-from psfdae.image.layers import Layers, find_layers, with_photons
+from psfdae.image.layers import Layers, add_photon_noise, find_layers
 from psfdae.image.observation import ListedStars, Observation
 from psfdae.image.positions import (
     SAME_STAR_PX,
@@ -77,7 +77,7 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
     camera, remarks = camera_values(image, user_camera), unread_card_remarks(image)
     noise_correlation = 1.0
     if not is_cube:
-        camera, camera_remarks, noise_correlation = checked_camera(image, camera)
+        camera, camera_remarks, noise_correlation = check_camera(image, camera)
         remarks += [*camera_remarks, *sky_coordinate_remarks(image)]
     # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
     image = image.to_noise_unit()
@@ -93,7 +93,7 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
             remarks += [f"{source.path}: {note}" for note in sky.notes]
             if layers.noise is not None:
                 layers = replace(layers, noise=replace(layers.noise, scale=sky.noise_scale))
-                layers, camera, photon_remarks = with_photons(layers, camera, sky)
+                layers, camera, photon_remarks = add_photon_noise(layers, camera, sky)
                 remarks += photon_remarks
             if threshold is not None:
                 detections = detect_stars(source.path, sky, threshold, image.unit_factor)

@@ -17,7 +17,7 @@ from psfdae.image.catalogue import Catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, sky_frame
 from psfdae.image.layers import Layers
-from psfdae.image.list_origin import TOLERANCE_PX, origin_of
+from psfdae.image.list_origin import TOLERANCE_PX, find_origin
 from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
 
@@ -98,7 +98,7 @@ def add_origin(table: Catalogue, columns: Positions, layers: Layers) -> tuple[Po
     # Centroids of the stars differ from the pixels of the list by the origin.
     list_pixels = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
     try:
-        data_origin = origin_of(layers.sky(), list_pixels)
+        data_origin = find_origin(layers.sky(), list_pixels)
     except ObservationError:  # no sky can be measured
         data_origin = None
     if data_origin is None:

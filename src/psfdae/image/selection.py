@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.base.errors import Error, keyword
 from psfdae.base.progress import task
 from psfdae.base.settings import CalibrationStars, Stamp
-from psfdae.image.interpolation import interpolated_stamps
+from psfdae.image.interpolation import fill_bad_stamps
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image, sky_around
 from psfdae.image.star_criteria import (
@@ -257,7 +257,7 @@ def measure_stamps(
     # increase the noise that is measured around a star.
     depth = -BrightStars.defect_sigma * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
     bad = (stamps.bad | (light < depth)) & ~off_image
-    light = interpolated_stamps(np.maximum(light, depth), bad)
+    light = fill_bad_stamps(np.maximum(light, depth), bad)
     # Brightest pixel, flux and S/N.
     reach_px = min(settings.search_px, (wide_px - 5) // 2)
     centring = settings.centring_px or 0.0

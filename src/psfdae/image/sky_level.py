@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from psfdae.image.interpolation import interpolated
+from psfdae.image.interpolation import fill_bad
 from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
 
 
@@ -131,7 +131,7 @@ def level_and_noise(
     # Structure that is finer than the meshes: σ of a mesh over σ from differences of neighbouring
     # pixels is larger there than elsewhere by a factor of 1.5; in resampled images it is larger
     # everywhere. Both change slowly: every fourth pixel is enough.
-    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
+    pixel_sigma = pixel_noise(fill_bad(image, bad)[0], bad)
     sample = np.s_[::4, ::4]
     ratio = noise[sample] / pixel_sigma[sample]
     ratio = ratio[~bad[sample] & (ratio > 0)]
@@ -360,7 +360,7 @@ def median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return the median (h, w) of the 14 × 14 px around each pixel, from means of 2 × 2 px."""
     # Means of squares of 2 × 2 px, the last row or column repeated where the number is odd.
     height, width = image.shape
-    even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
+    even_sized = np.pad(fill_bad(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
     squares = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2)
     square_means = squares.mean(axis=(1, 3))
     # Median of 7 × 7 squares, smoothed by σ = 1 square.

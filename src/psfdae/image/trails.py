@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from psfdae.image.bad_pixels import BadPixels
-from psfdae.image.interpolation import interpolated
+from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, sky_level
 from psfdae.stars.moments import SIGMA_OF_MAD
 
@@ -162,7 +162,7 @@ def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
 
 def smooth_light(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> np.ndarray:
     """Return an image (h, w) above its sky, smoothed by 3 × 3 px: its noise is σ/3."""
-    return np.asarray(scipy.ndimage.uniform_filter(interpolated(image - sky.level, bad)[0], 3))
+    return np.asarray(scipy.ndimage.uniform_filter(fill_bad(image - sky.level, bad)[0], 3))
 
 
 def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.ndarray, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -24,12 +24,20 @@ from psfdae.methods.interface import (
     Storage,
     TrainingSet,
 )
-from psfdae.methods.networks.settings import DaeSettings, Train
+from psfdae.methods.networks.settings import DaeSettings, Train, image_scale
+from psfdae.methods.networks.weights import channels_last, load_network, save_weights
 
 if TYPE_CHECKING:
     from psfdae.methods.networks.dae import DaeNetwork
 
 WEIGHTS = "dae.safetensors"
+
+
+def _build_network(kernels: Sequence[int], widths: Sequence[int]) -> DaeNetwork:
+    """Return a network with random weights; torch is imported here, and not with this module."""
+    from psfdae.methods.networks.dae import DaeNetwork
+
+    return DaeNetwork(kernels, widths)
 
 
 class Dae(Method):
@@ -85,8 +93,7 @@ class Dae(Method):
             If the network at which it should begin has another shape or scale of images.
         """
         from psfdae.methods.networks import training as loop
-        from psfdae.methods.networks.dae import DaeNetwork, DaeTraining
-        from psfdae.methods.networks.weights import channels_last
+        from psfdae.methods.networks.dae import DaeTraining
 
         # Everything that determines the result: settings, seed, noise, and the stars themselves.
         decisions = {"dae": dump_deciding(dae), "train": dump_deciding(train), "seed": data.seed}
@@ -116,7 +123,7 @@ class Dae(Method):
             begin = partial(DaeTraining, data, dae, train, data.seed)
             training = loop.train(begin, data.checkpoint, digest, report, train.restarts)
         # A new network with the best weights; the network of the training has the last ones.
-        network = DaeNetwork(dae.kernels, dae.widths)
+        network = _build_network(dae.kernels, dae.widths)
         network.load_state_dict(training.result)
         return cls(
             channels_last(network).eval(),
@@ -133,14 +140,10 @@ class Dae(Method):
 
     def factor(self, stamp_px: int) -> float:
         """Return the factor from images of sum 1 to inputs of the network."""
-        from psfdae.methods.networks.dae import image_scale
-
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
     def save(self, place: Path, config: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
-        from psfdae.methods.networks.weights import save_weights
-
         # The configuration is part of the weights' file, too, as metadata.
         save_weights(place / WEIGHTS, self.network.state_dict(), config)
         write_text(place / CONFIG, as_yaml({**config, "attempt": self.attempt}))
@@ -153,8 +156,6 @@ class Dae(Method):
         import torch
 
         from psfdae.base.settings import parse_settings
-        from psfdae.methods.networks.dae import DaeNetwork
-        from psfdae.methods.networks.weights import load_network
 
         config = cls.read_config(place)
         # The shape of the network is in its configuration, its weights are in another file.
@@ -168,7 +169,7 @@ class Dae(Method):
         if evaluation is not None:
             torch.set_num_threads(evaluation.threads)
         network = load_network(
-            lambda: DaeNetwork(settings.kernels, settings.widths), place / WEIGHTS
+            lambda: _build_network(settings.kernels, settings.widths), place / WEIGHTS
         )
         return cls(network, settings.scale)
 
@@ -190,12 +191,9 @@ class Dae(Method):
         """Return the network of a bundle."""
         import torch
 
-        from psfdae.methods.networks.dae import DaeNetwork
-        from psfdae.methods.networks.weights import channels_last
-
         assert info.dae is not None and info.image_scale is not None
         # Copies, because torch would share memory with arrays that may be read-only.
-        network = DaeNetwork(info.dae.kernels, info.dae.widths)
+        network = _build_network(info.dae.kernels, info.dae.widths)
         network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
         return cls(channels_last(network).eval(), float(info.image_scale))
 

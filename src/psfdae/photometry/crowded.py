@@ -3,7 +3,7 @@
 All stars are fitted at once (`psfdae.photometry.joint_fit`). Stars that are fainter, or in the
 light of brighter ones, are then found where the models are subtracted
 (`psfdae.photometry.matched_filter`), and all are fitted again, on a sky without the light of stars,
-until no more are found. Stars that were found there and have no flux of 3 σ are dropped. The light
+until no more are found. Stars that were found there with a flux below 3 σ are dropped. The light
 that a star has beyond its stamp is measured with them (`psfdae.psf.wings`).
 """
 
@@ -28,7 +28,7 @@ from psfdae.psf.interface import FieldPsfs, aperture_correction
 from psfdae.psf.wings import Wings, outer_shares
 
 MAX_CHI2_RATIO = 2.5
-"""Median χ² of an image's bright stars, over that of the training, from which all are flagged."""
+"""Median χ² of an image's bright stars, over the training's, from which all are flagged."""
 
 RESIDUAL_SNR = 4.0
 """Minimum S/N of a star in the residuals: of 10⁶ pixels of noise, some 25 peaks are higher."""
@@ -46,12 +46,12 @@ class CrowdedPhotometry:
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`
         (stars in a chain of neighbours), `chi2` (reduced, of the pixels of the fit), `flags`
         (`StarFlag`s), `photutils_flags`. Stars of a list have its `id` and come in its order.
-        Errors are √χ² times those of the noise where χ² > 1; that of the flux has the model's,
-        too (`FieldPsfs.flux_error`).
+        Errors are √χ² times the errors by noise where χ² > 1; the flux error includes the
+        model's error (`FieldPsfs.flux_error`).
     residual, light : ndarray, shape (h, w)
-        Image without sky and stars, and that of all stars, counts.
+        Image without sky and stars, and light of all stars, counts.
     wings : Wings or None
-        Wings in the fluxes: those of the image, or of the model if no star is bright enough to show
+        Wings in the fluxes: of the image, or of the model if no star is bright enough to show
         any.
     image_wings : Wings or None
         Wings of the image, which faint stars hardly show; None without a star that has light.
@@ -82,7 +82,7 @@ class CrowdedPhotometry:
         half = self.model.stamp_px / 2
         return half if self.wings is None else float(self.wings.radius_px[-1])
 
-    def part_of_model(self) -> tuple[float, float]:
+    def compute_model_share(self) -> tuple[float, float]:
         """Return the part of a typical star's flux that is in the stamp, and its standard error."""
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
@@ -102,7 +102,7 @@ def photometry(
     model : FieldPsfs
         That knows the PSF at every place of this image.
     observation : Observation
-        The image with its stars. No others are looked for if they are those of a list.
+        The image with its stars. If they come from a list, no others are searched for.
     threshold : float
         Minimum S/N of stars that are found where the models of others are subtracted.
     turns : int
@@ -113,13 +113,13 @@ def photometry(
     PredictionError
         If the model knows no PSF of a place.
     ObservationError
-        If there is no sky to measure.
+        If the sky cannot be measured.
     """
     from scipy.ndimage import map_coordinates
 
     observation, unit = observation.to_sky_unit(), observation.unit_factor
     # PSFs of the field, and lengths that follow from the PSF in its middle.
-    psfs = PsfGrid.of(model, by_magnitude=True).times(unit)
+    psfs = PsfGrid.sample(model, by_magnitude=True).times(unit)
     fwhm, side = model.fwhm_px(), model.stamp_px
     # Side of the pixels that are fitted to a star, odd, about 1.6 FWHM.
     box_px = 2 * int(np.ceil(1.6 * fwhm / 2)) + 1
@@ -129,8 +129,8 @@ def photometry(
     # The image with its sky; saturated pixels are not fitted.
     sky, limit = observation.sky(), observation.saturate
     image = sky.flat + sky.level
-    saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
-    bad = sky.bad | saturated
+    is_saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
+    bad = sky.bad | is_saturated
     sky = replace(sky, bad=bad)
     # Stars start where the list or the detection has them, with the wings of the model.
     origin, flux = np.array(observation.positions, dtype=np.float64), None
@@ -149,9 +149,9 @@ def photometry(
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
         fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
-        # At first, stars are no better known than to the error of the wings.
+        # At first, the fluxes have the error of the wings.
         sky, wing_light, wings, halo_error = around_stars(
-            image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, saturated
+            image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, is_saturated
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
@@ -180,7 +180,7 @@ def photometry(
     rows_columns = np.nan_to_num(fit.place[:, ::-1]).T
     light_error = area_px * map_coordinates(halo_error, rows_columns, order=1, mode="nearest")
     stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm, light_error)
-    stars["flags"] |= star_flags(stars, bad & ~saturated, saturated, box_px, fwhm)
+    stars["flags"] |= star_flags(stars, bad & ~is_saturated, is_saturated, box_px, fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
     light = fit.light + wing_light
@@ -230,7 +230,7 @@ def tabulate_stars(
     # Light that no model explains, of the PSF's own errors or of undetected stars, is as much
     # in the fluxes as in the residuals.
     excess = np.sqrt(np.fmax(fit.chi2, 1.0))
-    # The errors of the PSF and of the wings are no noise, and are as large a part of each flux,
+    # The errors of the PSF and of the wings are not noise, but the same fraction of each flux,
     # whatever its χ²: σ² = χ² σ_noise² + σ_halo² + (σ_model F)² + (σ_wings F)².
     relative_error = np.hypot(model.flux_error(fit.place), total_error / total)
     # Stars of a list keep its numbers and flags.
@@ -286,7 +286,7 @@ def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
 
 
 def star_flags(
-    stars: Table, bad: np.ndarray, saturated: np.ndarray, side: int, fwhm: float
+    stars: Table, bad: np.ndarray, is_saturated: np.ndarray, side: int, fwhm: float
 ) -> np.ndarray:
     """Return the flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
 
@@ -294,9 +294,10 @@ def star_flags(
     ----------
     stars : Table
         As in `CrowdedPhotometry`.
-    bad, saturated : ndarray of bool, shape (h, w)
+    bad, is_saturated : ndarray of bool, shape (h, w)
         Pixels that were not fitted.
     side : int
+        Side of the boxes, odd.
     fwhm : float
         In pixels.
     """
@@ -311,7 +312,7 @@ def star_flags(
     half = side // 2
     edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
-    for pixels, flag in ((bad, StarFlag.MASKED), (saturated, StarFlag.SATURATED)):
+    for pixels, flag in ((bad, StarFlag.MASKED), (is_saturated, StarFlag.SATURATED)):
         raise_flag(flags, flag, is_located & maximum_filter(pixels, side, mode="constant")[at])
     raise_flag(flags, StarFlag.TRUNCATED, edge & is_located)
     # Flux, fit and neighbours.

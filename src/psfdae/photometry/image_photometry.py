@@ -1,7 +1,7 @@
 """Photometry of the stars of an image in one call, for the command line and for Python.
 
-In go a model that knows the PSF at every place, an image and what is stated about it, and perhaps
-reference stars; out come a table of all stars, and the image without its sky and stars. The fit
+Inputs: a model that knows the PSF at every position, an image with its options, and perhaps
+reference stars. Outputs: a table of all stars, and the image without its sky and stars. The fit
 itself is in `psfdae.photometry.crowded`.
 """
 
@@ -25,13 +25,13 @@ from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.image.tables import star_table
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
-from psfdae.photometry.photon_noise import with_measured_gain
+from psfdae.photometry.photon_noise import add_measured_gain
 from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import robust_scatter
 
 
 class PhotometryError(Error, ValueError):
-    """Statements that exclude each other, or too few stars for a zero point."""
+    """Options that exclude each other, or too few stars for a zero point."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class ImagePhotometry:
 
     Attributes
     ----------
-    measured : CrowdedPhotometry
+    star_fit : CrowdedPhotometry
         The fit; its `residual` is the image without sky and stars.
     table : QTable
         A row for each star, with units, magnitudes if the zero point is known, sky coordinates if
@@ -49,10 +49,10 @@ class ImagePhotometry:
     notes : tuple of str
         Sentences on the image, its list, the zero point and the light that fluxes contain.
     wcs : WCS or None
-        That of the image.
+        World coordinates of the image.
     """
 
-    measured: CrowdedPhotometry
+    star_fit: CrowdedPhotometry
     table: QTable
     notes: tuple[str, ...]
     wcs: WCS | None
@@ -62,11 +62,11 @@ class ImagePhotometry:
         """Image without its sky and stars, in the unit of the image and with its WCS."""
         from astropy.nddata import CCDData
 
-        pixels, unit = self.measured.residual.astype(np.float32), self.table["flux"].unit
+        pixels, unit = self.star_fit.residual.astype(np.float32), self.table["flux"].unit
         return CCDData(pixels, unit=unit, wcs=self.wcs)
 
 
-def photometry_of_image(
+def measure_all_stars(
     model: FieldPsfs,
     source: ImageInput,
     zero_point: float | None = None,
@@ -81,8 +81,8 @@ def photometry_of_image(
     model : FieldPsfs
         Model that knows the PSF at every place of this image.
     source : ImageInput
-        The image, and what is stated about it. With `detect`, its `origin` is that of the
-        reference.
+        The image with its options. With `detect`, its `origin` applies to the list of reference
+        stars.
     zero_point : float, optional
         Magnitude of a flux of 1.
     reference : StarList, optional
@@ -95,14 +95,14 @@ def photometry_of_image(
     Raises
     ------
     PhotometryError
-        If statements exclude each other, the image is a cube, or fewer than three reference stars
+        If options exclude each other, the image is a cube, or fewer than three reference stars
         are stars of the image.
     PredictionError
         If the model knows no PSF of a place, or has pixels of another scale.
     ObservationError
         If the image or a list cannot be used.
     """
-    # Refuse statements that do not fit together.
+    # Reject options that do not fit together.
     if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
         raise PhotometryError(
             f"{keyword('zero_point')} takes a number, or {keyword('reference')} gives it"
@@ -111,12 +111,12 @@ def photometry_of_image(
         raise PhotometryError(
             f"{source.path}: stars get the PSF of the mean colour: no {keyword('colour_column')}"
         )
-    # With --detect, no list of the image needs an origin: it is that of the reference.
+    # With --detect, the origin applies to the list of reference stars.
     origin = source.origin
     if reference is not None and source.detect:
         source = replace(source, origin=None)
-    # The model must know the PSF at every place (`field_range` refuses others), and have pixels
-    # as large as those of the image.
+    # The model must know the PSF at every place (`field_range` rejects others), and have pixels
+    # as large as the image's.
     model.field_range()
     observation = opened or open_observation(source, model.stamp_px).assume_scale()
     if observation.shape is None:
@@ -134,28 +134,28 @@ def photometry_of_image(
         magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
 
     # All stars of the image, and the zero point by those that the reference has.
-    observation = with_measured_gain(model, observation)
-    measured, list_note = measure_stars(model, observation, source.given_threshold)
+    observation = add_measured_gain(model, observation)
+    star_fit, list_note = measure_stars(model, observation, source.given_threshold)
     zero_point_note = None
     if magnitudes is not None:
-        zero_point, scatter, zero_point_note = measure_zero_point(measured, *magnitudes)
-    table = photometry_table(measured, observation, zero_point)
+        zero_point, scatter, zero_point_note = measure_zero_point(star_fit, *magnitudes)
+    table = photometry_table(star_fit, observation, zero_point)
     table.meta |= {
         "INFILE": ascii_line(source.path.name),
-        "PSFMODEL": ascii_line(measured.model.name),
-        "PSFSHA": measured.model.sha256,
-        "FLUXRAD": measured.radius_px,
-        "INMODEL": measured.part_of_model()[0],
+        "PSFMODEL": ascii_line(star_fit.model.name),
+        "PSFSHA": star_fit.model.sha256,
+        "FLUXRAD": star_fit.radius_px,
+        "INMODEL": star_fit.compute_model_share()[0],
         **({} if zero_point is None else {"ZEROPT": zero_point}),
         **({} if scatter is None else {"ZEROPTSD": scatter}),
     }
-    if measured.chi2_ratio > crowded.MAX_CHI2_RATIO:
-        misfit = f"χ² of bright stars is {measured.chi2_ratio:.3g} times the training's (median)"
+    if star_fit.chi2_ratio > crowded.MAX_CHI2_RATIO:
+        misfit = f"χ² of bright stars is {star_fit.chi2_ratio:.3g} times the training's (median)"
         frame_notes.append(f"{source.path}: {misfit}, all are flagged UNLIKE_TRAINING: {CAUSES}")
     warn(frame_notes)
-    notes = zero_point_note, observation.summary(), list_note, *light_notes(measured, source)
+    notes = zero_point_note, observation.summary(), list_note, *light_notes(star_fit, source)
     notes = (*notes, *frame_notes)
-    return ImagePhotometry(measured, table, tuple(filter(None, notes)), observation.wcs)
+    return ImagePhotometry(star_fit, table, tuple(filter(None, notes)), observation.wcs)
 
 
 def measure_stars(
@@ -166,6 +166,7 @@ def measure_stars(
     Parameters
     ----------
     model : FieldPsfs
+        Model that knows the PSF at every position.
     observation : Observation
         The image with its stars.
     threshold : float, optional
@@ -175,41 +176,41 @@ def measure_stars(
 
     Returns
     -------
-    measured : CrowdedPhotometry
+    star_fit : CrowdedPhotometry
         The stars, and the image without them.
     list_note : str or None
         A sentence on how far the stars are off the positions of their list, if there is one.
     """
-    # A row without a position cannot be fitted, and one of a star that is listed twice has no
-    # light of its own: measure the others, and add flagged rows for these.
+    # A row without a position cannot be fitted, and a star that is listed twice would share its
+    # light: measure the others, and add flagged rows for these.
     unusable = observation.lacks_position() | observation.find_repeated_stars()
     usable = observation.select(~unusable) if unusable.any() else observation
-    measured = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR, turns)
+    star_fit = crowded.photometry(model, usable, threshold or crowded.RESIDUAL_SNR, turns)
     if unusable.any():
-        stars = with_unmeasured_rows(measured.stars, observation, unusable)
-        measured = replace(measured, stars=stars)
-    if observation.catalogue is None or len(measured.stars) != observation.count:
-        return measured, None
+        stars = add_unmeasured_rows(star_fit.stars, observation, unusable)
+        star_fit = replace(star_fit, stars=stars)
+    if observation.catalogue is None or len(star_fit.stars) != observation.count:
+        return star_fit, None
     # The stars are fitted where they are, whatever the list says.
-    offset = np.stack([measured.stars["x"], measured.stars["y"]], axis=1) - observation.positions
-    return measured, list_offset(observation.catalogue, offset, accept=True)
+    offset = np.stack([star_fit.stars["x"], star_fit.stars["y"]], axis=1) - observation.positions
+    return star_fit, list_offset(observation.catalogue, offset, accept=True)
 
 
-def light_notes(measured: CrowdedPhotometry, source: ImageInput) -> list[str]:
+def light_notes(star_fit: CrowdedPhotometry, source: ImageInput) -> list[str]:
     """Return sentences on the light that fluxes contain, and on their bias."""
-    # How much of a flux the model of the PSF does not have.
-    if measured.wings is None:
+    # The fraction of a flux outside the model of the PSF.
+    if star_fit.wings is None:
         notes = ["no star is bright enough to show light beyond the model's stamp"]
     else:
-        part, part_error = measured.part_of_model()
+        part, part_error = star_fit.compute_model_share()
         notes = [
-            f"fluxes are the light within {measured.radius_px:.3g} px; the model of the PSF has "
+            f"fluxes are the light within {star_fit.radius_px:.3g} px; the model of the PSF has "
             f"{100 * part:.2f} ± {100 * part_error:.2f} % of it"
         ]
-        model_wings = measured.model.wings
-        if model_wings is not None and measured.wings.differs_from(model_wings):
+        model_wings = star_fit.model.wings
+        if model_wings is not None and star_fit.wings.differs_from(model_wings):
             notes.append(
-                f"light outside the stamps: {measured.wings} in this image, which its fluxes have; "
+                f"light outside the stamps: {star_fit.wings} in this image, which its fluxes have; "
                 f"{model_wings} in the training, which flux_total of psfdae predict has"
             )
     if source.detect:
@@ -221,7 +222,7 @@ def light_notes(measured: CrowdedPhotometry, source: ImageInput) -> list[str]:
     return notes
 
 
-def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
+def add_unmeasured_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
     """Return a row for every star of the list; those that were not measured have NaN and flags.
 
     Parameters
@@ -239,10 +240,10 @@ def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.nd
     # Each column with 0 or NaN in the rows that were not measured.
     rows = Table()
     for name in stars.colnames:
-        measured = np.array(stars[name])
-        missing = np.nan if measured.dtype.kind == "f" else 0
-        rows[name] = np.full(len(unusable), missing, measured.dtype)
-        rows[name][~unusable] = measured
+        column = np.array(stars[name])
+        missing = np.nan if column.dtype.kind == "f" else 0
+        rows[name] = np.full(len(unusable), missing, column.dtype)
+        rows[name][~unusable] = column
     # What the list says of these stars.
     rows["id"] = observation.stars.id
     rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
@@ -252,7 +253,7 @@ def with_unmeasured_rows(stars: Table, observation: Observation, unusable: np.nd
 
 
 def measure_zero_point(
-    measured: CrowdedPhotometry, positions: np.ndarray, magnitude: np.ndarray, reference: str
+    star_fit: CrowdedPhotometry, positions: np.ndarray, magnitude: np.ndarray, reference: str
 ) -> tuple[float, float, str]:
     """Return the zero point, the scatter of its stars, and a sentence with its standard error.
 
@@ -260,7 +261,7 @@ def measure_zero_point(
 
     Parameters
     ----------
-    measured : CrowdedPhotometry
+    star_fit : CrowdedPhotometry
         Stars of the image with their fluxes F.
     positions : ndarray, shape (n, 2)
         Pixel positions x, y of the reference stars in the image.
@@ -277,16 +278,16 @@ def measure_zero_point(
     from scipy.spatial import cKDTree
 
     # Stars of the image with a flux above 0, and reference stars with position and magnitude.
-    stars = measured.stars
+    stars = star_fit.stars
     flux = np.array(stars["flux"], dtype=np.float64)
     has_flux = np.flatnonzero(np.isfinite(flux) & (flux > 0))
     star_positions = np.stack([stars["x"], stars["y"]], axis=1)[has_flux]
     complete = np.isfinite(positions).all(axis=1) & np.isfinite(magnitude)
     # Each reference star is the nearest star of the image if that is within half a FWHM.
     distance_px, star = cKDTree(star_positions).query(positions[complete])
-    matched = distance_px < 0.5 * measured.model.fwhm_px()
+    is_match = distance_px < 0.5 * star_fit.model.fwhm_px()
     # ZP = m + 2.5 log₁₀ F for each; the median, as stars may be variable or matched wrongly.
-    zero_points = magnitude[complete][matched] + 2.5 * np.log10(flux[has_flux[star[matched]]])
+    zero_points = magnitude[complete][is_match] + 2.5 * np.log10(flux[has_flux[star[is_match]]])
     count = len(zero_points)
     if count < 3:
         raise PhotometryError(
@@ -300,22 +301,22 @@ def measure_zero_point(
 
 
 def photometry_table(
-    measured: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
+    star_fit: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
 ) -> QTable:
     """Return the stars with units, magnitudes, sky coordinates and the columns of their list.
 
     Parameters
     ----------
-    measured : CrowdedPhotometry
+    star_fit : CrowdedPhotometry
         The stars; one for every star of the observation if these are of a list.
     observation : Observation
         The image, which has the unit of the fluxes and, perhaps, a WCS.
     zero_point : float, optional
-        Magnitude of a flux of 1; without it there are no magnitudes.
+        Magnitude of a flux of 1; if None, the table lacks magnitudes.
     """
     # Columns of the fit; magnitudes if the zero point is known, and places on the sky.
-    columns = {name: np.array(measured.stars[name]) for name in measured.stars.colnames}
-    columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
+    columns = {name: np.array(star_fit.stars[name]) for name in star_fit.stars.colnames}
+    columns["flags"] = columns["flags"].astype(np.int32)  # FITS does not have unsigned integers
     with np.errstate(all="ignore"):
         if zero_point is not None:
             # m = ZP − 2.5 log₁₀ F, and σ_m = 2.5 / ln 10 · σ_F / F.

@@ -5,7 +5,7 @@ The image x is the sum of the light of its stars, each a flux F times the PSF P 
     x = Σ_i F_i P(p − p_i) + n,    n ~ N(0, σ²).
 
 The parameters of a star are those for which the derivatives of its light, in a box of pixels about
-it, have no part of the residuals of the whole model left, Σ_box (x − model) ∂model_i / σ² = 0:
+it, are orthogonal to the residuals of the whole model, Σ_box (x − model) ∂model_i / σ² = 0:
 the light that every other star has in the box belongs to the model, but what the PSF is like far
 from the star does not decide. The equations of stars whose boxes overlap are solved together, by
 Gauss–Newton steps on one sparse matrix (Stetson 1987, PASP 99, 191, solves them group by group).
@@ -68,6 +68,7 @@ def fit_stars(
     Parameters
     ----------
     psfs : PsfGrid
+        PSFs on a grid over the image, of flux 1.
     image, error : ndarray, shape (h, w)
         Image without its sky, and σ of its pixels, counts.
     bad : ndarray of bool, shape (h, w)
@@ -100,8 +101,8 @@ def fit_stars(
         move = np.clip(fit.place + move, middle - range_px, middle + range_px) - fit.place
         step = np.column_stack([step[:, 0], move])
         # A group is at rest if its χ² would fall by less than 0.01: it is within 0.1 σ.
-        expected = np.bincount(group, (step * gradient).sum(axis=1))
-        moving = (expected > 0.01)[group]
+        expected_gain = np.bincount(group, (step * gradient).sum(axis=1))
+        moving = (expected_gain > 0.01)[group]
         if not moving.any():
             break
         # Stars of a group at rest stay where they are.
@@ -111,7 +112,7 @@ def fit_stars(
         # taken back, and the next one is shorter the less this one was worth what was expected.
         squares = fit.squares()
         gain = np.bincount(group, cost - squares)
-        is_worse, is_poor = ((gain < part * expected)[group] & moving for part in (-0.5, 0.1))
+        is_worse, is_poor = ((gain < part * expected_gain)[group] & moving for part in (-0.5, 0.1))
         back = np.flatnonzero(is_worse)
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
@@ -127,10 +128,10 @@ def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
     """
     from scipy.spatial import cKDTree
 
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
-    # Numbers of the tree are those of the located stars.
-    pairs = cKDTree(place[located]).query_pairs(distance_px, output_type="ndarray")
-    return np.asarray(located[pairs])
+    rows_with_place = np.flatnonzero(np.isfinite(place).all(axis=1))
+    # The tree numbers the located stars.
+    pairs = cKDTree(place[rows_with_place]).query_pairs(distance_px, output_type="ndarray")
+    return np.asarray(rows_with_place[pairs])
 
 
 def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
@@ -148,7 +149,7 @@ def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
 
 
 class _Fit:
-    """State of a fit of m stars: their places and fluxes, and what they leave of the image.
+    """State of a fit of m stars: their positions and fluxes, and the residuals of the image.
 
     The image has a border, as wide as a stamp, of pixels that do not count, so that stamps of
     stars at its edge are whole.
@@ -179,9 +180,9 @@ class _Fit:
         self.stars = np.flatnonzero(on_image)
         self._middle = np.rint(place[self.stars]).astype(int)
         pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
-        fitted = pixels >= self.parameters
+        is_fitted = pixels >= self.parameters
         self.stars, self._middle, self.pixels = (
-            values[fitted] for values in (self.stars, self._middle, pixels)
+            values[is_fitted] for values in (self.stars, self._middle, pixels)
         )
         # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
         # are the pixels of all boxes.
@@ -219,9 +220,9 @@ class _Fit:
         np.subtract.at(self.residual.reshape(-1), self._stamps[rows], light)
 
     def set_flux(self, flux: np.ndarray) -> None:
-        """Give the stars, which have none yet, fluxes (m,)."""
+        """Set the first fluxes (m,) of the stars."""
         self.flux = flux.astype(np.float64)
-        # Where the PSF changes with the magnitude, it is that of these fluxes from now on.
+        # Where the PSF changes with the magnitude, these fluxes determine it from now on.
         if self.psfs.magnitudes.size:
             self._draw(np.arange(len(flux)))
         self._subtract(np.arange(len(flux)), self.flux)
@@ -232,7 +233,7 @@ class _Fit:
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
         """Change flux, x and y of some stars by (k, 3)."""
-        # The light as it was goes back into the residuals, and that of the new place is taken off.
+        # The old light is added to the residuals, and the light at the new position is subtracted.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
         self.place[rows] += change[:, 1:]
@@ -260,8 +261,8 @@ class _Fit:
 
         # Levenberg's damping is a part of the diagonal, which is 1 in these units.
         matrix, unit = _normal_matrix(design, self._rows, prior)
-        added = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
-        matrix = (matrix + diags_array(added)).tocsc()
+        damping_diagonal = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
+        matrix = (matrix + diags_array(damping_diagonal)).tocsc()
         # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
         residual = self.weight * self.residual.ravel()[self.boxes]
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
@@ -294,8 +295,8 @@ class _Fit:
         flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
         flags += 8 * moving + 32 * bound.any(axis=1)
 
-        def of_all(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
-            # Rows of all stars of the list; those that were not fitted have no value.
+        def fill_rows(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
+            # Rows of all stars of the list, without a value for stars that were not fitted.
             column = np.full((count, *values.shape[1:]), missing, values.dtype)
             column[self.stars] = values
             return column
@@ -305,13 +306,13 @@ class _Fit:
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
         np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
         return JointFit(
-            of_all(self.place),
-            of_all(error[:, 1:]),
-            of_all(self.flux),
-            of_all(error[:, 0]),
-            of_all(bias),
-            of_all(chi2),
-            of_all(flags, 64),  # no overlap with usable pixels
+            fill_rows(self.place),
+            fill_rows(error[:, 1:]),
+            fill_rows(self.flux),
+            fill_rows(error[:, 0]),
+            fill_rows(bias),
+            fill_rows(chi2),
+            fill_rows(flags, 64),  # no overlap with usable pixels
             light,
         )
 
@@ -348,7 +349,7 @@ def _normal_matrix(
     rows = np.repeat(boxes.reshape(stars, 1, size), parameters, axis=1).ravel()
     ends = size * np.arange(unit.size + 1)
     columns = csc_array((values, rows, ends), shape=(int(boxes.max(initial=0)) + 1, unit.size))
-    # Two stars in one place have no fluxes of their own: a millionth more parts them evenly.
+    # Two stars at one position make the matrix singular: a millionth more splits their flux.
     diagonal = diags_array((prior / unit**2).ravel() + 1e-6)
     return (columns.T @ columns + diagonal).tocsc(), unit
 
@@ -356,8 +357,8 @@ def _normal_matrix(
 def standard_errors(matrix: csc_array, unit: np.ndarray) -> np.ndarray:
     """Return the standard errors (m, k) of the k parameters of m stars.
 
-    Those of a star are from the inverse of the part of the matrix that belongs to it and to the
-    stars whose boxes overlap with its own; what these share with others changes little.
+    A star's covariance comes from the inverse of the part of the matrix that belongs to it and to
+    the stars whose boxes overlap with its own; what these share with others changes little.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Photon noise of an image of which nobody states the gain, from the pixels of its stars.
+"""Photon noise of an image of unknown gain, from the pixels of its stars.
 
 The variance of a pixel with the light L of a star in it is
 
@@ -6,7 +6,7 @@ The variance of a pixel with the light L of a star in it is
 
 with the noise σ of the sky, the gain g in electrons per count, and what the PSF of the star is off
 by, ε (photon transfer: Janesick 2007, Photon Transfer, SPIE). The residuals of fainter and brighter
-stars tell the last two apart.
+stars separate the last two.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.
     return np.hypot(noise, np.sqrt(np.maximum(light, 0.0) / gain)) if gain else noise
 
 
-def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
+def add_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
     """Return the observation with the gain that its stars show, if it is not known.
 
     It stays unknown where they do not show it at 5 σ, as in an image without photon noise.
@@ -37,16 +37,16 @@ def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observatio
     PredictionError
         If the model knows no PSF of a place.
     ObservationError
-        If there is no sky to measure.
+        If the sky cannot be measured.
     """
     if observation.gain is not None or observation.positions is None:
         return observation
     sky, limit = observation.sky(), observation.to_sky_unit().saturate
     bad = sky.bad if limit is None else sky.bad | (sky.flat + sky.level >= limit)
-    measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
-    if measured is None:
+    gain_and_error = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
+    if gain_and_error is None:
         return observation
-    gain = measured[0] * observation.unit_factor
+    gain = gain_and_error[0] * observation.unit_factor
     value = CameraValue(gain, "about, by the scatter of the pixels of stars")
     return replace(observation, camera=observation.camera | {"gain": value})
 
@@ -59,9 +59,11 @@ def measure_gain(
     Parameters
     ----------
     model : FieldPsfs
+        Model that knows the PSF at every position.
     flat, noise : ndarray, shape (h, w)
         Sky-subtracted counts, and σ of the sky.
     bad : ndarray of bool, shape (h, w)
+        Pixels that are not used.
     place : ndarray, shape (n, 2)
         x and y of stars, NaN where unknown.
 
@@ -92,7 +94,7 @@ def measure_gain(
     data, sigma = (image[pixels].reshape(len(place), -1) for image in (flat, noise))
     unit = float(np.median(sigma))
     data, sigma = data / unit, sigma / unit
-    psfs, photons, off = PsfGrid.of(model), 0.0, 0.0
+    psfs, photons, off = PsfGrid.sample(model), 0.0, 0.0
     light = np.zeros(data.shape)
     for _ in range(4):
         # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
@@ -102,13 +104,13 @@ def measure_gain(
         design = np.pad(light_and_slopes, ((0, 0), (0, 1), (0, 0)), constant_values=1.0)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
-        weighted = design / variance[..., None]
-        inverse = np.linalg.inv(weighted.transpose(0, 2, 1) @ design)
-        fitted = (inverse @ (weighted.transpose(0, 2, 1) @ data[..., None]))[..., 0]
-        light = np.maximum(fitted[:, :1] * design[..., 0], 0.0)
+        weighted_design = design / variance[..., None]
+        inverse = np.linalg.inv(weighted_design.transpose(0, 2, 1) @ design)
+        parameters = (inverse @ (weighted_design.transpose(0, 2, 1) @ data[..., None]))[..., 0]
+        light = np.maximum(parameters[:, :1] * design[..., 0], 0.0)
         # A residual has the part 1 − h of its pixel's variance, with the leverage h of the fit.
-        leverage = np.einsum("npi,nij,npj->np", design, inverse, weighted)
-        residual = data - (design @ fitted[..., None])[..., 0]
+        leverage = np.einsum("npi,nij,npj->np", design, inverse, weighted_design)
+        residual = data - (design @ parameters[..., None])[..., 0]
         residual /= np.sqrt(np.clip(1.0 - leverage, 0.05, 1.0))
         # Stars that are off by far more than others have neighbours that are on no list.
         chi2 = (residual**2 / variance).mean(axis=1)
@@ -117,7 +119,7 @@ def measure_gain(
             light[is_fitted], residual[is_fitted], sigma[is_fitted]
         )
         # Centres stay in their pixel, about which the box lies.
-        move = np.clip(fitted[:, 1:3] / np.maximum(fitted[:, :1], 1e-12), -0.2, 0.2)
+        move = np.clip(parameters[:, 1:3] / np.maximum(parameters[:, :1], 1e-12), -0.2, 0.2)
         middle = np.stack([column, row], axis=1)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
     # g = 1 / (photons · unit), and σ_g = g σ_photons / photons.
@@ -127,7 +129,7 @@ def measure_gain(
 
 
 def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: float) -> np.ndarray:
-    """Return which stars at places (n, 2) have no bad pixel in their box, and no star beside them.
+    """Return which stars at positions (n, 2) have neither bad pixels in their box nor neighbours.
 
     The box has 2 `half_px` + 1 pixels along each side and is whole in the image, of which `bad`
     (h, w) pixels do not count.
@@ -135,18 +137,18 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     from scipy.ndimage import maximum_filter
     from scipy.spatial import cKDTree
 
-    located = np.flatnonzero(np.isfinite(place).all(axis=1))
+    rows_with_place = np.flatnonzero(np.isfinite(place).all(axis=1))
     is_alone = np.zeros(len(place), dtype=bool)
-    if len(located) < 2:
+    if len(rows_with_place) < 2:
         return is_alone
     # The nearest star of the list but the star itself.
-    distance = cKDTree(place[located]).query(place[located], k=2)[0][:, 1]
+    distance = cKDTree(place[rows_with_place]).query(place[rows_with_place], k=2)[0][:, 1]
     # Beyond its edges, an image has only bad pixels.
-    masked = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
-    column, row = np.floor(place[located] + 0.5).astype(int).T
+    has_bad_pixel = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
+    column, row = np.floor(place[rows_with_place] + 0.5).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < bad.shape[1]) & (row < bad.shape[0])
-    masked = masked[np.where(inside, row, 0), np.where(inside, column, 0)]
-    is_alone[located] = inside & ~masked & (distance > distance_px)
+    has_bad_pixel = has_bad_pixel[np.where(inside, row, 0), np.where(inside, column, 0)]
+    is_alone[rows_with_place] = inside & ~has_bad_pixel & (distance > distance_px)
     return is_alone
 
 
@@ -162,9 +164,9 @@ def photon_transfer(
 
     # Bins of pixels in the order of L/σ²; pixels where it is below 0.02 show no photon noise.
     light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
-    scaled = light / sigma**2
-    order = np.argsort(scaled, kind="stable")
-    order = order[scaled[order] > 0.02]
+    light_over_variance = light / sigma**2
+    order = np.argsort(light_over_variance, kind="stable")
+    order = order[light_over_variance[order] > 0.02]
     bins = np.array_split(order, max(len(order) // 60, 1))
     if len(bins) < 6:
         return 0.0, np.inf, 0.0
@@ -172,18 +174,18 @@ def photon_transfer(
     # Terms of the law in each bin, L/σ² and L²/σ², and the variance of r/σ.
     linear, square = (
         np.array([values[members].mean() for members in bins])
-        for values in (scaled, light * scaled)
+        for values in (light_over_variance, light * light_over_variance)
     )
     modulus = np.abs(residual / sigma)
     variance = np.array([SIGMA_OF_MAD * np.median(modulus[members]) for members in bins]) ** 2
     # Weighted least squares of a and b ≥ 0 in v/σ² − 1 = a L/σ² + b L²/σ²; weights follow from the
     # variances that the last fit expects.
-    expected = np.maximum(variance, 1.0)
+    expected_variance = np.maximum(variance, 1.0)
     for _ in range(5):
-        weight = np.sqrt(count) / (2.33 * expected)
+        weight = np.sqrt(count) / (2.33 * expected_variance)
         design = np.stack([linear, square], axis=1) * weight[:, None]
         coefficients, residual_norm = nnls(design, (variance - 1.0) * weight)
-        expected = 1.0 + coefficients[0] * linear + coefficients[1] * square
+        expected_variance = 1.0 + coefficients[0] * linear + coefficients[1] * square
     # Standard error of a; where the law does not hold, it is known as badly as χ² says.
     excess = max(residual_norm**2 / (len(bins) - 2), 1.0)
     error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])

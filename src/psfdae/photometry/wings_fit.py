@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.base.progress import steps
-from psfdae.image.detection import Sky, sky_of
+from psfdae.image.detection import Sky, find_sky
 from psfdae.image.sky_level import level_and_noise
 from psfdae.image.trails import find_saturated_cores
 from psfdae.psf.wings import Wings, compute_prior_profile, tents
@@ -29,8 +29,8 @@ class StarFluxes(NamedTuple):
     place : ndarray, shape (n, 2)
         x and y in px; NaN where unknown.
     flux : ndarray, shape (n,)
-        In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 have no
-        wings.
+        In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 are
+        left out.
     outer_share : ndarray, shape (n,)
         Part of the light in the outer part of the stamp, as `outer_shares` gives it; NaN: no wings.
     """
@@ -84,10 +84,10 @@ def draw_tents(
     # The tents of a whole image would take K times its memory.
     for top in steps("wings", range(0, height, 128)):
         rows = slice(top, min(top + 128, height))
-        tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
+        band_tents = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
         for window, tented_star in star_tents(rows, width, stars, wings):
-            tented[:, *window] += tented_star
-        yield rows, tented
+            band_tents[:, *window] += tented_star
+        yield rows, band_tents
 
 
 def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
@@ -100,7 +100,7 @@ def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -
     return image
 
 
-def wings_of(
+def fit_wings(
     residual: np.ndarray,
     sigma: np.ndarray,
     bad: np.ndarray,
@@ -118,10 +118,13 @@ def wings_of(
     residual, sigma : ndarray, shape (h, w)
         What is left of the image, and σ of its pixels, in its unit.
     bad : ndarray of bool, shape (h, w)
+        Pixels that are not fitted.
     stars : StarFluxes
+        Positions and fluxes of the stars.
     stamp_px : int
         Side of the models' stamps.
     earlier : Wings, optional
+        Wings of the previous fit, whose tents are used again.
 
     Returns
     -------
@@ -130,7 +133,7 @@ def wings_of(
     """
     from scipy.ndimage import uniform_filter
 
-    # Six tents, of which the last one ends 2.5 stamps from the star; those of an earlier fit stay.
+    # Six tents, of which the last one ends 2.5 stamps from the star; an earlier fit's tents stay.
     radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
     if earlier is not None:
         radius = earlier.radius_px
@@ -143,7 +146,7 @@ def wings_of(
     if not mean_share > 0:
         return None
     count = len(radius)
-    unfitted = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
+    wings_without_light = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
     # So σ² is averaged over a stamp.
@@ -157,14 +160,14 @@ def wings_of(
     # of A is (F s h_k, 1)/σ of a pixel, and d its residual over σ; the same in blocks of a stamp.
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
     square, pixels, blocks = 0.0, 0, []
-    for band, tented in draw_tents(residual.shape, stars, unfitted):
+    for band, band_tents in draw_tents(residual.shape, stars, wings_without_light):
         is_used = ~bad[band]
         if earlier is not None:
-            deviation = residual[band] - np.tensordot(earlier.profile, tented, 1)
+            deviation = residual[band] - np.tensordot(earlier.profile, band_tents, 1)
             # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
             is_used &= np.abs(deviation) < 4.0 * sigma[band]
         weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
-        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
+        design = np.concatenate([band_tents, np.ones((1, *weight.shape))]) * weight
         flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
         normal, projection = normal + flat @ flat.T, projection + flat @ data
         square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
@@ -177,14 +180,14 @@ def wings_of(
         return None
     *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
     # Least squares of p with its prior, and of the even light without one, in units of the prior's
-    # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, that
-    # of the pixels and that of sums over blocks: an uneven sky and undetected sources leave
+    # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, χ²
+    # of the pixels and χ² of sums over blocks: an uneven sky and undetected sources leave
     # residuals that neighbours share, as wide as wings.
-    expected, prior_sigma = compute_prior_profile(radius, mean_share)
+    prior_profile, prior_sigma = compute_prior_profile(radius, mean_share)
     unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
     normal, projection = normal * unit * unit[:, None], projection * unit
     prior = np.diag(np.append(np.ones(count), 0.0))
-    prior_projection = np.append(expected / prior_sigma, 0.0)
+    prior_projection = np.append(prior_profile / prior_sigma, 0.0)
     # χ² depends on x: three rounds.
     chi2 = 1.0
     for _ in range(3):
@@ -261,14 +264,14 @@ def around_stars(
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
     without_light = without_stars - light_of_wings
-    sky = sky_of(without_light, sky.bad, sigma_map, structure=sky.structure)
+    sky = find_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
     del without_light
     # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
-    clipped = sky.bad | (np.abs(deviation) > 4.0)
+    is_excluded = sky.bad | (np.abs(deviation) > 4.0)
     # Mean deviation Σ (d/σ)/σ over Σ 1/σ².
-    weight = np.where(clipped, 0.0, 1.0 / sigma)
+    weight = np.where(is_excluded, 0.0, 1.0 / sigma)
     deviation *= weight
     weight *= weight
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
@@ -416,7 +419,7 @@ def _wings_beside(
             # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
             # small.
             residual -= draw_wings(bad.shape, unlike_psf, previous)
-        wings = wings_of(residual, sigma, bad, stars, stamp_px, previous)
+        wings = fit_wings(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break
         # Until their light changes by less than a part of its error.

@@ -55,6 +55,7 @@ class FieldFile(FieldPsfs):
         """Accept any scale: these files do not say how large pixels are."""
 
     def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
+        """Return interpolated PSFs of flux 1 at positions (n, 2 to 4)."""
         position = position[:, :2]  # neither magnitude nor colour
         # Offset of the star from the middle of its pixel.
         phase = position - np.floor(position + 0.5)
@@ -100,7 +101,7 @@ class GridField(FieldFile):
     Raises
     ------
     ObservationError
-        If the file is missing or damaged, or its positions are no grid.
+        If the file is missing or damaged, or its positions are not a grid.
     PredictionError
         If its positions are of several detectors.
     """
@@ -138,6 +139,7 @@ class GridField(FieldFile):
         return self.low, self.high
 
     def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Interpolate by photutils' grid of PSFs."""
         pixels = position[..., None] + axis - phase[..., None]
         stars = zip(position, pixels, strict=True)
         return np.stack(
@@ -146,7 +148,7 @@ class GridField(FieldFile):
 
 
 class PsfexField(FieldFile):
-    """Model of PSFEx; beyond the stars it was made of, the PSF is that of their edge.
+    """Model of PSFEx; outside the field of its stars, the PSF is as at their edge.
 
     Parameters
     ----------
@@ -209,7 +211,7 @@ class PsfexField(FieldFile):
         Raises
         ------
         PredictionError, KeyError, TypeError, ValueError
-            If the header lacks a key, or has one that is no model of the position.
+            If the header lacks a key, or has one that is not a model of the position.
         """
         # Coordinates of the polynomial: none, or x and y in one group.
         axis_count = int(header["POLNAXIS"])
@@ -256,6 +258,7 @@ class PsfexField(FieldFile):
         return self.zero - self.width / 2, self.zero + self.width / 2
 
     def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Interpolate by PSFEx's polynomial and kernel."""
         # Sampled PSF Σ uⁱ vʲ b_ij, with u and v within the field of the stars.
         u, v = np.clip((position - self.zero) / self.width, -0.5, 0.5).T
         samples = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
@@ -269,7 +272,7 @@ class PsfexField(FieldFile):
 def _lanczos(offset: np.ndarray, count: int) -> np.ndarray:
     """Return the weights (…, count) of samples at offsets (…) from the middle one, count//2.
 
-    The kernel is that of PSFEx, sinc(t) sinc(t / 4) for |t| < 4.
+    The kernel is as in PSFEx, sinc(t) sinc(t / 4) for |t| < 4.
     """
 
     def kernel(t: np.ndarray) -> np.ndarray:
@@ -295,7 +298,9 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     Parameters
     ----------
     path : Path
+        File to write; it is replaced if it exists.
     model : FieldPsfs
+        Model that knows the PSF at every position.
     oversampling : int
         Samples per pixel and axis.
 
@@ -307,7 +312,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     Raises
     ------
     PredictionError
-        If the model knows no PSF of a position, or the PSF would have no middle sample.
+        If the model knows no PSF of a position, or the number of samples would be even.
     """
     from astropy.io import fits
 
@@ -336,7 +341,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     psfs = model.psf_at(x, y, oversampling)
     basis = np.tensordot(np.linalg.pinv(terms), psfs, 1)
     error = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
-    # Readers show the FWHM; it is that of the PSF in the middle of the list of positions.
+    # Readers show the FWHM, here of the PSF in the middle of the list of positions.
     fwhm = float(measure_shapes(psfs[len(psfs) // 2][None]).fwhm_px[0]) / oversampling
     # One table of one row, whose only cell has the images of all terms.
     size = basis.shape[-1]
@@ -369,14 +374,16 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     Parameters
     ----------
     path : Path
+        File to write; it is replaced if it exists.
     model : FieldPsfs
+        Model that knows the PSF at every position.
     columns, rows : int
         Positions along x and along y, evenly over the field.
 
     Raises
     ------
     PredictionError
-        If the grid has too many positions, or photutils would take the name for that of a detector.
+        If the grid has too many positions, or photutils would take the name for a detector's.
     """
     # Keys have two digits for the number of a column or row.
     if max(columns, rows) > 99:
@@ -401,7 +408,9 @@ def write_grid(path: Path, model: FieldPsfs, positions: np.ndarray, oversampling
     Parameters
     ----------
     path : Path
+        File to write; it is replaced if it exists.
     model : FieldPsfs
+        Model that knows the PSF at every position.
     positions : ndarray, shape (n, 2)
         Columns and rows, 0-based; the header has them as rows and columns.
     oversampling : int
@@ -428,13 +437,15 @@ def _write_cube(
     Parameters
     ----------
     path : Path
+        File to write; it is replaced if it exists.
     model : FieldPsfs
+        Model that knows the PSF at every position.
     positions : ndarray, shape (n, 2)
-        Positions x and y; PSFs are those of the nearest whole pixel.
+        Positions x and y; PSFs are drawn at the nearest whole pixel.
     oversampling : int
         Values per pixel and axis.
     cards : list of Card
-        Cards of the format, which follow those of the model.
+        Cards of the format, which follow the model's cards.
     """
     from astropy.io import fits
 

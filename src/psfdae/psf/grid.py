@@ -31,7 +31,7 @@ class PsfGrid:
     oversampling : int
         Values per pixel and axis.
     magnitudes : ndarray, shape (0,) or (3,)
-        Equidistant magnitudes, ascending, or none. Beyond them the PSF is that of the nearest one.
+        Equidistant magnitudes, ascending, or none. Outside them the PSF is as at the nearest one.
     """
 
     columns: np.ndarray
@@ -41,7 +41,7 @@ class PsfGrid:
     magnitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(
+    def sample(
         cls, model: FieldPsfs, nodes: int = 9, oversampling: int = 4, by_magnitude: bool = False
     ) -> PsfGrid:
         """Sample a model at `nodes` × `nodes` positions over the field of its training stars.
@@ -59,7 +59,7 @@ class PsfGrid:
         magnitudes = np.zeros(0) if ends is None else np.linspace(*ends, 3)
         layers = [None] if ends is None else magnitudes.tolist()
         psfs = np.stack([model.psf_at(x, y, oversampling, mag=mag) for mag in layers])
-        # An even stamp has no middle value; with a row and a column of zeros it has.
+        # An even stamp lacks a middle value: add a row and a column of zeros.
         psfs = np.pad(psfs, ((0, 0), (0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
         psfs = psfs.reshape(*[3] * (ends is not None), nodes, nodes, *psfs.shape[2:])
         return cls(x[:nodes], y[::nodes], psfs, oversampling, magnitudes)
@@ -96,7 +96,7 @@ class PsfGrid:
             Side of the stamps.
         flux : ndarray, shape (n,), optional
             Fluxes, counts, by which the PSFs differ if the grid has magnitudes. Where they are NaN
-            or not given, the PSF is that of the middle magnitude.
+            or not given, the PSF is as at the middle magnitude.
 
         Returns
         -------

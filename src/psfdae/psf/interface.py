@@ -170,8 +170,8 @@ class FieldPsfs(ABC):
             Values per pixel and axis; each is what a whole pixel there would get.
         mag, colour : float or array, shape (n,), optional
             Instrumental magnitude −2.5 log₁₀ (flux / counts), and colour as in the star list; by
-            default the PSF is the average over those of the training stars. Beyond these stars it
-            is that of the nearest end of their range; it changes with either only where stars that
+            default the PSF is the average over the training stars. Outside their range it
+            is as at the nearest end; it changes with either only where stars that
             were left out of the training say so.
 
         Returns
@@ -185,9 +185,9 @@ class FieldPsfs(ABC):
         ------
         PredictionError
             If the model's method knows no PSF between the stars, a number is not usable, or the
-            model has no PSF of a finite flux above 0 at a position.
+            model's PSF at a position does not have a finite flux above 0.
         """
-        # Columns up to the last one that is stated; NaN where a column before it is not.
+        # Columns up to the last given one; NaN for a missing column before it.
         columns = {"x": x, "y": y, "mag": mag, "colour": colour}
         is_stated = [value is not None for value in columns.values()]
         count = 4 if is_stated[3] else 3 if is_stated[2] else 2
@@ -239,7 +239,7 @@ class FieldPsfs(ABC):
         Raises
         ------
         ValueError
-            If the radius is not above 0, or is larger than that of the flux.
+            If the radius is not above 0, or is larger than the radius of the flux.
         PredictionError
             As `psf_at`.
         """

@@ -32,7 +32,7 @@ def make_photutils_grid(model: FieldPsfs, nodes: int, oversampling: int) -> Grid
     from astropy.nddata import NDData
 
     # photutils takes PSFs on a regular grid, x changing fastest, and interpolates between them.
-    grid = PsfGrid.of(model, nodes, oversampling)
+    grid = PsfGrid.sample(model, nodes, oversampling)
     positions = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
     meta = {"grid_xypos": [*map(tuple, positions)], "oversampling": oversampling}
     model_class = grid_class(f"FieldPSF_{model.sha256[:12]}_{nodes}_{oversampling}")

@@ -30,8 +30,8 @@ class Wings:
     Attributes
     ----------
     radius_px : ndarray, shape (K,)
-        r_1 … r_K: tops of the K − 1 tents, r_1 half the side of the stamp; from r_K on there is no
-        light.
+        r_1 … r_K: tops of the K − 1 tents, r_1 half the side of the stamp; the light ends at
+        r_K.
     profile : ndarray, shape (K,)
         p_0 … p_{K−1}, part of the flux per pixel: p_0 in the stamp, p_k (r_k/r_1)^-3 at r_k.
     covariance : ndarray, shape (K, K)
@@ -41,7 +41,7 @@ class Wings:
     outer_part_from : float
         Radius at which the outer part of a stamp begins, over half its side.
     steepness : float
-        Power of 1/r in the tents: that of light that mirrors and air scatter.
+        Power of 1/r in the tents, as of light that mirrors and air scatter.
     """
 
     outer_part_from: ClassVar[float] = 0.7
@@ -59,7 +59,7 @@ class Wings:
         Raises
         ------
         ValueError
-            If one is missing, they do not fit together, or their light is no part of a star's.
+            If one is missing, they do not fit together, or their light exceeds the star's.
         """
         # A number of another type, or one that is missing, is as wrong as one that does not fit.
         names = ("radius_px", "profile", "covariance")
@@ -82,13 +82,13 @@ class Wings:
         return wings
 
     def plain(self) -> dict[str, Any]:
-        """Lists and numbers, for a bundle."""
+        """Return lists and numbers, for a bundle."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
     def scale(self, outer_share: np.ndarray) -> np.ndarray:
         """Return s of stars with these `outer_shares` (n,), 1 where they are not known (NaN)."""
         ratio = np.where(np.isfinite(outer_share), outer_share / self.outer_share, 1.0)
-        # A factor of three in either direction is no PSF of the same telescope.
+        # A factor of three in either direction cannot be a PSF of the same telescope.
         return np.asarray(np.clip(ratio, 0.3, 3.0))
 
     def total_over_flux(self, outer_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +144,7 @@ class Wings:
         return sentence
 
     @classmethod
-    def joined(cls, several: Sequence[Wings]) -> Wings:
+    def join(cls, several: Sequence[Wings]) -> Wings:
         """Average the wings of several images with one model, weighted by 1/σ² of their light."""
         weight = np.array([wings.light()[1] ** -2.0 for wings in several])
         weight /= weight.sum()

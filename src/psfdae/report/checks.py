@@ -1,4 +1,4 @@
-"""Comparison of a model with one mean PSF, and checks that tell whether to trust it.
+"""Comparison of a model with one mean PSF, and checks that show whether to trust it.
 
 The numbers come from stars that no training saw (`psfdae.report.validation`); the answers stand in
 the report page (`psfdae.report.page`).
@@ -70,7 +70,7 @@ def fit_mean_psf(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.nda
 
 
 def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]:
-    """Return the MSE of a method over that of a reference method by S/N, ascending.
+    """Return the MSE of a method over the MSE of a reference method by S/N, ascending.
 
     `errors` has the columns snr, method and mse. S/N at which a method was not measured are absent.
     """
@@ -112,7 +112,7 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
 
 
 def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare sizes and shapes of restored stars with those of their bright images.
+    """Compare sizes and shapes of denoised stars with their bright images.
 
     Parameters
     ----------
@@ -122,12 +122,12 @@ def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     Returns
     -------
     size_error : ndarray, shape (n,)
-        FWHM over that of the bright image, minus 1.
+        FWHM over the FWHM of the bright image, minus 1.
     ellipticity_error : ndarray, shape (n,)
-        Ellipticity minus that of the bright image.
+        Ellipticity minus the ellipticity of the bright image.
     """
-    restored, truth = (measure_shapes(images[name]) for name in ("model", "truth"))
-    return restored.fwhm_px / truth.fwhm_px - 1.0, restored.ellipticity - truth.ellipticity
+    model, truth = (measure_shapes(images[name]) for name in ("model", "truth"))
+    return model.fwhm_px / truth.fwhm_px - 1.0, model.ellipticity - truth.ellipticity
 
 
 def method_labels(errors: Table) -> dict[str, str]:
@@ -147,7 +147,7 @@ def check_held_out(
     errors: Table,
     photometry: Table,
     coverage: Mapping[float, float],
-    degraded: Mapping[float, Mapping[str, np.ndarray]],
+    denoised_images: Mapping[float, Mapping[str, np.ndarray]],
 ) -> list[Check]:
     """Check a model on held-out stars alone.
 
@@ -158,12 +158,12 @@ def check_held_out(
     errors, photometry : Table
         Columns of `report.csv`, and of `found.csv`.
     coverage : mapping of float to float
-        Fraction of the errors of pixels within their stated 68 % half-width, by S/N.
-    degraded : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Fraction of the errors of pixels within their predicted 68 % half-width, by S/N.
+    denoised_images : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
         (`model`) and by one mean PSF (`MEAN_PSF`).
     """
-    # Each row: question, answer at each S/N, and the verdict. What was not measured has no row.
+    # Each row: question, answer at each S/N, and the verdict. Unmeasured quantities have no row.
     rows: list[Check] = []
     # MSE beside the two simplest models of the PSF.
     for label, reference in (("one mean PSF", MEAN_PSF), ("linear MMSE", "lmmse")):
@@ -173,13 +173,13 @@ def check_held_out(
             rows.append((f"Better than {label}?", f"MSE × {by_snr}", max(ratios.values()) < 1))
     # Bias of the size: at most 2 % of the FWHM beyond two standard errors. The standard error of a
     # median is 1.25 σ/√n, of as many images as there are different stars.
-    snr, held_out = nearest_snr(degraded), int(errors["stars"][0])
-    size_error = size_errors(degraded[snr])[0]
+    snr, held_out = nearest_snr(denoised_images), int(errors["stars"][0])
+    size_error = size_errors(denoised_images[snr])[0]
     bias = float(np.median(size_error))
     stderr = 1.25 * float(size_error.std()) / np.sqrt(min(held_out, errors["images"][0]))
     answer = f"median {100 * bias:+.1f} ± {100 * stderr:.1f} %"
     rows.append((f"Size of stars of S/N {snr:.3g}", answer, abs(bias) < 0.02 + 2 * stderr))
-    # Coverage of the stated errors, of pixels and then of flux and centre.
+    # Coverage of the predicted errors, of pixels and then of flux and centre.
     low, high = 0.60, 0.76
     if coverage:
         by_snr = ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items()))

@@ -43,20 +43,20 @@ def errors_figure(errors: Table, model_method: str) -> Figure:
 
 
 @apply_style
-def error_maps(restored: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
+def error_maps(denoised_images: Mapping[float, Mapping[str, np.ndarray]]) -> Figure:
     """Draw mean and RMS, over held-out stars, of restored minus bright image.
 
-    Those of the S/N nearest to 10 are shown.
+    Stars of the S/N nearest to 10 are shown.
 
     Parameters
     ----------
-    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+    denoised_images : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Held-out stars by S/N: bright (`truth`), and as the model (`model`) and one mean PSF
         (`MEAN_PSF`) restore them from degraded images.
     """
     # S/N nearest to 10: models differ most for faint stars.
-    snr = nearest_snr(restored)
-    images = restored[snr]
+    snr = nearest_snr(denoised_images)
+    images = denoised_images[snr]
     # In per cent of the mean peak; each mean has its own colours, symmetric about 0.
     peak = images["truth"].max(axis=(1, 2)).mean()
     figure = new_figure(2.4, layout="constrained")
@@ -105,7 +105,7 @@ def residual_strip(stamps: np.ndarray, residuals: np.ndarray) -> Figure:
 def shapes_figure(
     stars: Mapping[str, np.ndarray],
     degraded_rows: np.ndarray,
-    restored: Mapping[float, Mapping[str, np.ndarray]],
+    denoised_images: Mapping[float, Mapping[str, np.ndarray]],
 ) -> Figure:
     """Draw FWHM and ellipticity against magnitude, x and y.
 
@@ -118,15 +118,15 @@ def shapes_figure(
         Columns flux, x, y, fwhm_px, ellipticity, flags and part of all stars.
     degraded_rows : ndarray of int, shape (n,)
         Row in `stars` of each held-out image.
-    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+    denoised_images : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Held-out images by S/N, as of `error_maps`.
     """
-    snr = nearest_snr(restored)
+    snr = nearest_snr(denoised_images)
     # Shapes of flagged stars mean nothing.
     usable = has_shape(stars["flags"]) & np.isfinite(stars["fwhm_px"])
     held_out = usable & (stars["part"] == "held out")
     # Errors of degraded stars: restored against bright image.
-    size_error, ellipticity_error = size_errors(restored[snr])
+    size_error, ellipticity_error = size_errors(denoised_images[snr])
     figure = new_figure(7.6, layout="constrained")
     grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
     rows = (
@@ -164,6 +164,7 @@ def chi2_figure(stars: Mapping[str, np.ndarray]) -> Figure:
     Parameters
     ----------
     stars : mapping of str to ndarray, shape (n,)
+        Columns of the stars, by name.
     """
     is_flagged, is_trained_on = stars["flags"] != 0, stars["part"] == "training"
     # Both axes are logarithmic.

@@ -1,4 +1,4 @@
-"""Photometry of held-out stars: errors of flux and centre, and whether the stated errors hold.
+"""Photometry of held-out stars: errors of flux and centre, and whether the predicted errors hold.
 
 In: a model, bright stars, and their images degraded to low S/N. Out: a table with a row for each
 S/N, of which the report page (`psfdae.report.page`) shows the most important columns.
@@ -21,7 +21,7 @@ from psfdae.training.stars import ImageStars
 
 
 def measure_photometry(
-    model: StarModel, stars: ImageStars, restored: Mapping[float, Mapping[str, np.ndarray]]
+    model: StarModel, stars: ImageStars, denoised_images: Mapping[float, Mapping[str, np.ndarray]]
 ) -> Table:
     """Measure held-out stars of flux 1 at each noise level λ, from their stamps and places alone.
 
@@ -31,8 +31,10 @@ def measure_photometry(
     Parameters
     ----------
     model : StarModel
+        Model that measures the stars.
     stars : ImageStars
-    restored : mapping of float to mapping of str to ndarray, shape (n, d, d)
+        Bright stars, some of them held out.
+    denoised_images : mapping of float to mapping of str to ndarray, shape (n, d, d)
         Degraded images (`noisy`) by noise level λ.
 
     Returns
@@ -40,8 +42,8 @@ def measure_photometry(
     Table
         Rows by S/N, ascending: `lost`, the part of the stars without a usable flux; bias of the
         flux, its pull, RMS error of the centre in px; and the parts of fluxes, coordinates of
-        centres and pixels whose errors are within the stated ones. A column that ends in `_stderr`
-        is the standard error of the one before it, clustered by star.
+        centres and pixels whose errors are within the predicted ones. A column that ends in
+        `_stderr` is the standard error of the one before it, clustered by star.
     """
     product, test = stars.product, stars.split.test
     kappa, background = stars.settings.noise.kappa, stars.settings.noise.background_photons
@@ -53,10 +55,10 @@ def measure_photometry(
     positions, noise = field_positions(product)[test], product["noise"][star]
     bright = model.predict(truth, flux=1.0, background=0.0, noise=noise, position=positions)
     rows = []
-    for level in sorted(restored, reverse=True):  # S/N ascending
+    for level in sorted(denoised_images, reverse=True):  # S/N ascending
         # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
         gain = np.sqrt(background) / (kappa * level)
-        estimate = model.predict(restored[level]["noisy"], gain=gain, position=positions)
+        estimate = model.predict(denoised_images[level]["noisy"], gain=gain, position=positions)
         # Stars that have a flux and an error of it.
         usable = np.isfinite(estimate.psf).all(axis=(1, 2)) & (estimate.flux_error > 0)
         # Offsets of the centre, and their standard errors, along x and y.
@@ -64,7 +66,7 @@ def measure_photometry(
         offset_error = np.stack(
             [np.hypot(estimate.x_error, bright.x_error), np.hypot(estimate.y_error, bright.y_error)]
         )
-        # Pull of the flux: its error over the standard error, that of the truth included.
+        # Pull of the flux: its error over the standard error, with the error of the truth.
         pull = np.abs(estimate.flux - 1.0) / np.hypot(estimate.flux_error, truth_flux_error)
         # Bias, quantile of the pull, and RMS of the distance of the centres.
         flux_bias, flux_bias_stderr = usable_mean(estimate.flux - 1.0, star, usable)
@@ -78,7 +80,7 @@ def measure_photometry(
             "flux_pull": flux_pull,
             "centre_rms_px": mean_square_px**0.5,
         }
-        # Coverage: fraction of errors within the stated ones.
+        # Coverage: fraction of errors within the predicted ones.
         pixel_error = np.hypot(estimate.uncertainty, truth_sigma)
         has_centre = np.isfinite(offset).all(axis=0)
         coverage = {
@@ -95,7 +97,7 @@ def measure_photometry(
 
 
 def usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
-    """Return the mean of usable images and its standard error, clustered by star; NaN of none.
+    """Return the mean of usable images and its standard error, clustered by star; NaN if none is.
 
     `values`, `star` and the mask `usable` have the shape (n,).
 
@@ -104,5 +106,6 @@ def usable_mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tup
     values, star : ndarray, shape (n,)
         Value of each image, and number of the star that it shows.
     usable : ndarray of bool, shape (n,)
+        True for images that are averaged.
     """
     return cluster_mean(values[usable], star[usable]) if usable.any() else (np.nan, np.nan)

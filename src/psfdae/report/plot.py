@@ -160,6 +160,7 @@ def _draw_whiskers(
     Parameters
     ----------
     axes : Axes
+        Axes of the map, whose unit is a pixel of the image.
     stars : mapping of str to ndarray, shape (n,)
         As in `psf_map`.
     selected_stars : ndarray of int

@@ -46,7 +46,7 @@ from psfdae.training.stars import ImageStars
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Errors of a model on stars that no training saw, which tell whether to trust it.
+    """Errors of a model on stars that no training saw, which show whether to trust it.
 
     Attributes
     ----------
@@ -61,13 +61,13 @@ class Report:
         Every metric of every method at every noise level: `metric`, its mean `value`, `stderr` and
         number of images `n`.
     per_star : Table
-        Every metric of every image; `star` is the number of the image, `field` that of its star.
+        Every metric of every image; `star` numbers the images, `field` their stars.
     photometry : Table
         Photometry by S/N: what `predict` makes of the held-out images where no flux, sky, noise
         and centre is given. Part of the stars without a usable flux (`lost`), relative bias of the
         flux, its pull (what 68.27 % of |error| over the standard error are below: 1 if errors
         hold), RMS error of the centre in px, and coverage of fluxes, centres and pixels: the parts
-        that are within their stated errors, with standard errors clustered by star.
+        that are within their predicted errors, with standard errors clustered by star.
     restored : dict
         By noise level λ the held-out images (n, d, d): degraded (`noisy`), bright (`truth`), and
         restored by the model (`model`) and by one mean PSF (`mean_psf`).
@@ -107,10 +107,10 @@ class Report:
         Returns
         -------
         list of Check
-            They are of errors against the simplest models, of sizes of stars, and of stated
+            They compare errors with the simplest models, and check sizes of stars and predicted
             errors.
         """
-        # Coverage was measured when the model was made: that of another image has other S/N.
+        # Coverage was measured when the model was made; another image has other S/N.
         rows = self.model.info.metrics
         coverage = {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
         method = self.model.info.method
@@ -214,6 +214,7 @@ def _evenly_spread(position: np.ndarray, count: int) -> np.ndarray:
     position : ndarray, shape (n, 2)
         (x, y) of the stars.
     count : int
+        Maximum number of stars, at least 1.
     """
     if not np.isfinite(position).all():
         return np.arange(min(count, len(position)))
@@ -228,15 +229,20 @@ def _predict_all(
     Parameters
     ----------
     model : StarModel
+        Model that predicts the stars.
     stars : ImageStars
+        Bright stars of one or several images.
     shown : ndarray of int, shape (k,)
         Numbers of the stars whose residuals are kept.
 
     Returns
     -------
     columns : dict of str to ndarray, shape (N,)
+        Columns of the predictions, by name.
     psf : ndarray, shape (N, d, d)
+        Denoised stars, in the unit of the image.
     residuals : ndarray, shape (k, d, d)
+        Residuals of the shown stars, in their order.
     """
     # Lists of the batches: columns, PSFs, and residuals of the stars shown.
     columns: dict[str, list[np.ndarray]] = {}
@@ -252,14 +258,14 @@ def _predict_all(
         in_batch = (shown >= count) & (shown < count + len(prediction))
         residuals.append(prediction.residual[shown[in_batch] - count])
         count += len(prediction)
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    joined["flags"] = joined["flags"].astype(int)
-    # Residuals came in the order of the stars: back to that of `shown`.
-    return joined, np.concatenate(psfs), np.concatenate(residuals)[np.argsort(np.argsort(shown))]
+    table = {name: np.concatenate(values) for name, values in columns.items()}
+    table["flags"] = table["flags"].astype(int)
+    # Residuals came in the order of the stars: sort them back to the order of `shown`.
+    return table, np.concatenate(psfs), np.concatenate(residuals)[np.argsort(np.argsort(shown))]
 
 
 def level_scale(model: StarModel, stars: ImageStars, method_name: str) -> float:
-    """Return the factor from noise levels λ of stars to those of a method.
+    """Return the factor from noise levels λ of stars to noise levels of a method.
 
     It is 1 for all methods but the model's: the model may be of another image, whose noise level λ
     has another κ.
@@ -280,6 +286,7 @@ def quality_page(
     Parameters
     ----------
     report : Report
+        Errors of the model on held-out stars.
     stars : mapping of str to ndarray, shape (n,)
         Columns of the prediction of all stars, and `verdict` and `part` of `selection.csv`.
     degraded_rows : ndarray of int

@@ -44,6 +44,7 @@ def validate(
     model : StarModel
         It was fitted to these stars, or to another image of the same camera.
     stars : ImageStars
+        Bright stars of an image, some of them held out.
     further_fits : mapping of str to Method, optional
         Fits of other methods to these stars, by name, for the table.
 
@@ -64,7 +65,7 @@ def validate(
     model, notes = model.to_image_frame(stars.observation)
     warn(notes)
     settings = stars.settings
-    # The fits that exist already, that of the model included.
+    # The fits that exist already, with the model's own.
     fits = {**(further_fits or {}), model.info.method: model.method}
     # Every table has the noisy images and linear MMSE; both are quick to fit.
     baselines = ("noisy", "lmmse")
@@ -86,11 +87,11 @@ def _require_unseen(model: StarModel, stars: ImageStars) -> None:
     Raises
     ------
     PredictionError
-        If pixels or stamps differ from those of the model, or if it was trained on other stars of
+        If pixels or stamps differ from the model's, or if it was trained on other stars of
         the same image.
     """
     info, product, path = model.info, stars.product, stars.observation.path
-    # Pixels and stamps must have the size of those of the model.
+    # Pixels and stamps must have the size of the model's.
     model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
     if info.stamp_px != stars.settings.framing.stamp_px:
         raise PredictionError(
@@ -102,7 +103,7 @@ def _require_unseen(model: StarModel, stars: ImageStars) -> None:
     hashes = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
     if not {*", ".join(hashes).split(", ")} & {*product.config["image_sha256"].split(", ")}:
         return
-    # The training images of a model are those of these stars if their checksum is the same.
+    # A model was trained on these stars if the checksum of the training images is the same.
     train = stars.split.train
     if info.training_sha256 != checksum(
         product["realisation"][train], product[stars.reference][train]
@@ -119,16 +120,18 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
     Parameters
     ----------
     model : StarModel
+        Model to be tested.
     stars : ImageStars
+        Bright stars of an image, some of them held out.
     methods : mapping of str to Method
-        Fits by name, that of the model included.
+        Fits by name, with the model's own.
     """
     settings, product, test = stars.settings, stars.product, stars.split.test
     # Held-out images with their truth, star and place.
     truth, star = product[stars.reference][test], product["field_index"][test]
     position, data_range = field_positions(product)[test], settings.evaluation.data_range
     key = {"dataset": stars.name, "split": stars.split_kind, "reference": stars.reference}
-    rows, mean_rows, per_star, restored = [], [], [], {}
+    rows, mean_rows, per_star, denoised_images = [], [], [], {}
     for level in steps("stars held out", settings.noise.levels):
         noisy = noisy_test_images(settings, product, test, level)
         # The centre is fitted up to a pixel beyond the jitter: noise moves the brightest pixel.
@@ -145,7 +148,7 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
             per_star.append({**row, "star": test, "field": star, **metrics})
             if name == model.info.method:
                 images = {"noisy": noisy, "truth": truth, "model": estimate.psf}
-                restored[level] = images | {MEAN_PSF: by_mean_psf}
+                denoised_images[level] = images | {MEAN_PSF: by_mean_psf}
     return Report(
         model,
         stars,
@@ -153,8 +156,8 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
         _error_table([*rows, *mean_rows], stars, methods),
         rows_to_table(rows),
         join_tables(per_star),
-        measure_photometry(model, stars, restored),
-        restored,
+        measure_photometry(model, stars, denoised_images),
+        denoised_images,
     )
 
 
@@ -189,6 +192,7 @@ def _error_table(
     statistics : sequence of mappings
         Mean and standard error of each metric, by noise level and method.
     stars : ImageStars
+        Stars that were measured, with their noise levels.
     methods : mapping of str to Method
         Methods in the order of the rows; one mean PSF comes last.
     """

@@ -98,7 +98,7 @@ class StarErrors:
             None if score is None else score.reshape(shape),
         )
 
-    def of(self, is_selected: np.ndarray) -> StarErrors:
+    def select(self, is_selected: np.ndarray) -> StarErrors:
         """Return the errors of some of the stars, by a mask over stars; without their scores."""
         is_star_selected = is_selected[self.star]
         return StarErrors(
@@ -121,7 +121,7 @@ class StarErrors:
         return np.asarray(np.maximum(quantile, 0.25 * rms))
 
     def ratio95(self) -> np.ndarray:
-        """Return the half-width that holds 95 % of all pixels over that of 68 %, shape (S,)."""
+        """Return the ratio of the half-widths that hold 95 and 68 % of all pixels, shape (S,)."""
         # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
         # are taken to have the same distribution.
         scaled_error = self.error / np.maximum(self.half_width, 1e-12)[:, None]
@@ -145,14 +145,14 @@ class StarErrors:
 
     def distance_limit(self) -> float:
         """Return the distance that 0.1 % of the stars exceed."""
-        # Distances have the noise in their unit: those of all nodes count together.
+        # Distances have the noise in their unit: all nodes are used together.
         quantile = float(np.quantile(self.distance, 0.999))
         return max(quantile, float(self._few_star_limit(self.distance).max()))
 
     def _few_star_limit(self, distance: np.ndarray) -> np.ndarray:
         """Return the least limit (S,) of normal distances (S, N) of as few stars as there are.
 
-        Few stars do not show what 0.1 % exceed: the limit is that of a further star beside n normal
+        Few stars do not show what 0.1 % exceed: the limit is for one more star after n normal
         distances, mean + t (1 + 1/n)^½ σ with t of n − 1 degrees of freedom. It is 0 for a hundred
         or more, whose own quantile says it.
         """
@@ -241,7 +241,7 @@ def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
 
 
 def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorModel:
-    """Return the errors of a model with those of flux, sky and centre due to the PSF model.
+    """Return the errors of a model with errors of flux, sky and centre due to the PSF.
 
     Stars that are drawn from the uncertainty of the fit are measured with hardly any noise: what
     the errors by noise do not explain is due to the model. A method that measures no stars has
@@ -278,7 +278,7 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     sigma = np.concatenate([prediction.y_error, prediction.x_error])
     usable_centres = np.concatenate([usable, usable])
     centre_error = compute_excess(offset[usable_centres], sigma[usable_centres])
-    # Few fields are drawn: the error of the flux is not below that of a fit on a known sky.
+    # Few fields are drawn: the flux error is not below the error of a fit on a known sky.
     model_errors = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
     return replace(errors, model=model_errors)
 
@@ -375,7 +375,7 @@ def _scales_at(
         if not usable.any():
             continue
         noise[index] = np.median((prediction.noise / prediction.flux)[usable])
-        # 95 % of errors are within no less than 68 % are, though a star alone has no errors.
+        # The 95 % half-width is not below the 68 % one, although a single star has no errors.
         over_ratio = error[usable] / np.maximum(prediction.ratio95, 1.0)[usable, None, None]
         for brightness, pixels in enumerate((~is_bright[usable], is_bright[usable])):
             scale[0, *index, brightness] = np.quantile(error[usable][pixels], COVERAGE)
@@ -393,8 +393,8 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
 
     The noise of a training star is in the axes of the training, along which a star of the same
     noise is an outlier by as much as there are few of them. Training stars have less noise than the
-    lowest node, whose limit applies to all brighter stars. Simulated stars have no noise, and
-    change nothing.
+    lowest node, whose limit applies to all brighter stars. Simulated stars are noise-free,
+    and change nothing.
     """
     errors = model.bundle.errors
     if errors.outlier_limit is None or (bright := stars.bright) is None:
@@ -411,7 +411,7 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
         else 0.0
         for values in (prediction.outlier_score, prediction.distance)
     )
-    # The first node has the least noise, and its limit is that of all stars of less noise.
+    # The first node has the least noise, and its limit holds for all stars of less noise.
     outlier_limit = errors.outlier_limit.copy()
     outlier_limit[0] = max(outlier_limit[0], score)
     distance_limit = max(errors.distance_limit, distance)
@@ -419,7 +419,7 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
 
 
 def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float], dict[str, float]]:
-    """Return a function that tells how many errors are within half-widths of other stars.
+    """Return a function that counts errors within half-widths calibrated on other stars.
 
     Parameters
     ----------
@@ -431,14 +431,14 @@ def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float],
     callable
         Function of other errors of the same stars (n, d, d), each star once, and of their noise
         over the flux. It returns the parts `coverage68` and `coverage95` within the half-widths,
-        for either half of the stars by those of the other half; nothing for a star alone.
+        for either half of the stars by the other half; nothing for a single star.
     """
     # Stars that gave the half-widths would be covered too often: each half is judged by the other.
     count = 1 + int(errors.star.max())
     is_even = np.arange(count) % 2 == 0
     halves = []
     for half in (is_even, ~is_even) if count > 1 else ():
-        other_half = errors.of(~half)
+        other_half = errors.select(~half)
         width = other_half.half_width
         width95 = (width * other_half.ratio95()[:, None, None]).astype(width.dtype)
         halves.append((half, {"coverage68": width, "coverage95": width95}))

@@ -32,16 +32,16 @@ Model = TypeVar("Model", bound=StarModel)
 def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     """Adapt a model to the bright stars of another exposure of the same camera.
 
-    The PSF at a position changes from that of `model` by as much as cross-validation with the stars
-    supports. The scatter of stars about the field, and the calibration of errors, stay those of the
-    training of `model`.
+    The PSF at a position changes from the PSF of `model` by as much as cross-validation with the
+    stars supports. The scatter of stars about the field and the calibration of errors stay as in
+    `model`.
 
     Parameters
     ----------
     model : StarModel
         Model of the method field, trained on an exposure with many stars.
     source : ImageInput
-        The other exposure, and what is stated about it.
+        The other exposure, with its star list and options.
     name : str
         Name of the new model.
 
@@ -71,7 +71,7 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
             "exposure it was trained on"
         )
     settings = read_training_settings(model)
-    # Its bright stars, chosen as those of the training, but few are enough.
+    # Its bright stars, chosen as in the training, but few are enough.
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
     observation = open_observation(source, info.stamp_px, calibration.margin_px).assume_scale()
@@ -168,7 +168,7 @@ def adapt_to_stars(model: Model, stars: ImageStars) -> Model:
     Parameters
     ----------
     model : StarModel
-        Model of the method field, with stamps as large as those of the stars, that was not adapted
+        Model of the method field, with stamps as large as the stars' stamps, that was not adapted
         itself.
     stars : ImageStars
         Bright stars of the other image.
@@ -188,13 +188,13 @@ def _adapt(model: Model, observation: Observation, bright: BrightStars, name: st
     """Return a copy of a model with the field of an exposure, and a description that says so."""
     info, training, field = model.info, model.info.config["stars"], model.method
     assert isinstance(field, FieldMixture)
-    # New coefficients of the field; all other arrays, and errors, stay those of the training.
+    # New coefficients of the field; all other arrays, and errors, stay as in the training.
     sky = bright.sky_photons(observation.gain, field.noise.background)
     arrays, _ = field.refit_exposure(bright, sky).export(info.stamp_px, info.noise_min)
     weights = dict(model.bundle.weights)
     for key in ("coefficients", "listed"):
         weights[key] = arrays[key].astype(weights[key].dtype)
-    # The description names the new image, and keeps that of the training.
+    # The description names the new image, and keeps the image of the training.
     image = {
         "image": observation.path.name,
         "image_sha256": observation.sha256(),

@@ -18,7 +18,7 @@ from psfdae.methods import method as method_of
 from psfdae.methods.fit_files import describe_fit
 from psfdae.methods.interface import Method
 from psfdae.photometry.image_photometry import measure_stars
-from psfdae.photometry.photon_noise import with_measured_gain
+from psfdae.photometry.photon_noise import add_measured_gain
 from psfdae.psf.wings import Wings
 from psfdae.training.packing import add_wings, build_model
 from psfdae.training.settings import apply_keywords
@@ -39,9 +39,9 @@ def fit_model(
 ) -> StarModel:
     """Train a model on the bright stars of images, without those that are held out.
 
-    Parameters are those of `psfdae.fit`.
+    Parameters are as for `psfdae.fit`.
     """
-    # Candidates: the stated method, or all of the settings of which one becomes the model.
+    # Candidates: the given method, or all methods of the settings, of which the best is chosen.
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
     for method_name in names:
         if not makes_models(method_name):
@@ -79,7 +79,9 @@ def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = No
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of an image, with settings and split.
     kind : type of Method
+        Class of the method.
     checkpoint : Path, optional
         File for the state of a long fit, from which it goes on if it was interrupted.
 
@@ -94,12 +96,13 @@ def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = No
         return kind.fit(data, **kind.settings(stars.settings))
 
 
-def described(stars: ImageStars, kind: type[Method]) -> dict[str, Any]:
+def describe_settings(stars: ImageStars, kind: type[Method]) -> dict[str, Any]:
     """Return the settings that determine a fit, for the description of its product and model.
 
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of an image, with their settings.
     kind : type of Method
         The fitted method, whose groups of settings count beside split and truth.
     """
@@ -113,6 +116,7 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of an image, with their validation stars.
     fits : mapping of str to Method
         Fits to these stars, by name of the method.
 
@@ -158,6 +162,7 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
     Parameters
     ----------
     stars : ImageStars
+        Bright stars of an image, some of them held out.
     method_fit : Method
         Fit to these stars.
     name, licence : str
@@ -165,7 +170,7 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
     """
     # Calibrate the errors of the fit on held-out stars.
     settings = stars.settings
-    description = described(stars, type(method_fit))
+    description = describe_settings(stars, type(method_fit))
     with fix_threads(settings.evaluation.threads):
         model = build_model(
             method_fit, stars.product, ImageStars.reference, settings, description, name, licence
@@ -174,13 +179,13 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
             return model
         # Light outside the stamps, as the photometry of each image with this model measures it:
         # `flux_total` of a star and its flux by photometry are the same. Stars that are found in
-        # the residuals of the first fit change the wings by up to two of their errors, those of
+        # the residuals of the first fit change the wings by up to two of their errors, stars of
         # later fits by less than a quarter of one: three fits are enough.
         wings = []
         for image in stars.images:
-            observation = with_measured_gain(model, image.observation.assume_scale())
+            observation = add_measured_gain(model, image.observation.assume_scale())
             photometry, _ = measure_stars(model, observation, image.source.given_threshold, 3)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model
-    return StarModel(add_wings(model.bundle, Wings.joined(wings)), model.method)
+    return StarModel(add_wings(model.bundle, Wings.join(wings)), model.method)

@@ -51,7 +51,7 @@ def collect_stars(sources: Sequence[ImageInput], settings: Settings) -> ImageSta
         observation.check_planes()
     require_one_camera(observations)
     observations, candidates, relaxed_settings, notes = choose_bright_stars(observations, settings)
-    # Bright stars of each image; those of a crowded image again without their neighbours.
+    # Bright stars of each image; in a crowded image again without their neighbours.
     exposures = []
     for source, observation, image_candidates in zip(
         sources, observations, candidates, strict=True
@@ -82,8 +82,8 @@ def is_crowded(stars: ImageStars) -> bool:
     has_image = stars.observation.shape is not None
     if not has_image or not np.isfinite(stars.candidates.bright.position).all():
         return False
-    # With fewer than 5 stars, there is no field to fit neighbours with; with fewer stars that have
-    # neighbours than stars without, those without are enough.
+    # With fewer than 5 stars, a field cannot be fitted; if fewer stars have neighbours than not,
+    # the stars without are enough.
     crowded_count = np.count_nonzero(stars.candidates.verdict == Verdict.CROWDED)
     enough = max(len(stars), ENOUGH_STARS)
     return len(stars) >= MIN_STARS_WITH_ERROR and bool(crowded_count >= enough)

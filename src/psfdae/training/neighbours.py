@@ -1,6 +1,6 @@
 """Bright stars of a crowded image after the light of their neighbours is subtracted.
 
-Where many bright stars have a neighbour, a model of the field is made of those that have none. All
+Where many bright stars have a neighbour, a model of the field is fitted to stars without. All
 stars are then fitted with it, and in the stamp of each star the light of all others is subtracted.
 Stars whose neighbours are further away than about a FWHM can then be used for the training.
 """
@@ -32,6 +32,7 @@ class _Field(FieldPsfs):
     Parameters
     ----------
     method_fit : FieldMixture
+        Fit to the stars without neighbours.
     stamp_px : int
         Side of the stamps that the fit was made of.
     """
@@ -39,29 +40,29 @@ class _Field(FieldPsfs):
     name, image_px = "of stars without neighbours", None
 
     def __init__(self, method_fit: FieldMixture, stamp_px: int) -> None:
-        self.fitted, self.stamp_px = method_fit, stamp_px
+        self.method_fit, self.stamp_px = method_fit, stamp_px
 
     @property
     def order(self) -> int:
-        return self.fitted.order
+        return self.method_fit.order
 
     @cached_property
     def sha256(self) -> str:
-        return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
+        return hashlib.sha256(self.method_fit.coefficients.tobytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.fitted.low[:2], self.fitted.high[:2]
+        return self.method_fit.low[:2], self.method_fit.high[:2]
 
     @property
     def magnitude_range(self) -> tuple[float, float] | None:
-        low, high = self.fitted.low.tolist(), self.fitted.high.tolist()
+        low, high = self.method_fit.low.tolist(), self.method_fit.high.tolist()
         return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: the fit is used on its own image."""
 
     def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
-        return self.fitted.psf_at(position, oversampling)
+        return self.method_fit.psf_at(position, oversampling)
 
 
 def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
@@ -73,14 +74,14 @@ def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars
         Bright stars of one image. If they were chosen in spite of neighbours that are brighter than
         `neighbour_ratio`, they start a second round.
     neighbour_ratio : float
-        Largest brightness of an accepted neighbour, over that of the star.
+        Maximum brightness of an accepted neighbour, over the brightness of the star.
 
     Returns
     -------
     ImageStars
-        The stars as they were, with a note that tells why, if their image cannot be fitted.
+        The stars unchanged, with a note that gives the reason, if their image cannot be fitted.
     """
-    # The new choice has the stated limit on neighbours, and a nearer one on their distance.
+    # The new choice has the given limit on neighbours, and a nearer one on their distance.
     observation, notes = stars.observation, stars.notes
     accepted_ratio = stars.settings.calibration_stars.neighbour_ratio
     calibration = stars.settings.calibration_stars.model_copy(
@@ -94,7 +95,7 @@ def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars
         field = _Field(fit_method(stars, FieldMixture), settings.framing.stamp_px)
         try:
             photometry = crowded.photometry(field, observation)
-            # Within 1.25 FWHM, the light of two stars cannot be told apart well enough.
+            # Within 1.25 FWHM, the light of two stars cannot be separated well enough.
             isolation_px = 1.25 * field.fwhm_px()
             light = draw_other_stars(photometry, observation.positions)
             cleaned_observation = replace(observation, neighbour_light=light)
@@ -125,6 +126,7 @@ def draw_other_stars(
     Parameters
     ----------
     photometry : CrowdedPhotometry
+        Joint fit of all stars of the image, with their light.
     list_positions : ndarray, shape (n, 2)
         Positions of a star list, x and y.
 
@@ -140,7 +142,7 @@ def draw_other_stars(
     # Fluxes without the wings, which belong to no stamp alone.
     stars = photometry.stars
     centre = np.stack([stars["x"], stars["y"]], axis=1)
-    flux, psfs = np.array(stars["flux_model"]), PsfGrid.of(photometry.model, by_magnitude=True)
+    flux, psfs = np.array(stars["flux_model"]), PsfGrid.sample(photometry.model, by_magnitude=True)
     star_rows = np.flatnonzero(np.isfinite(centre).all(axis=1) & np.isfinite(stars["flux_model"]))
     # The fitted star of each star of the list; none is within 1.5 px of a star without position.
     distance, nearest = cKDTree(centre[star_rows]).query(np.nan_to_num(list_positions, nan=-np.inf))
@@ -149,7 +151,7 @@ def draw_other_stars(
     def light(rows: slice, stamp_px: int, margin: int) -> np.ndarray:
         x, y = list_positions[rows].T
         stamps = cut_image(photometry.light, photometry.light.shape, x, y, stamp_px, margin)[0]
-        # The light of all fitted stars, minus that of the star itself.
+        # The light of all fitted stars, minus the light of the star itself.
         fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
         star = star_rows[nearest[rows][fitted_rows]]
         corner = np.rint(list_positions[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin

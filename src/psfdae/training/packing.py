@@ -1,7 +1,7 @@
 """Packing of a fit: a model with its errors on test stars and all that it takes to apply it.
 
-In go a fitted method and the product "stars" that it was fitted to; out comes a `StarModel`, which
-a bundle keeps. Errors of the model are found in `psfdae.training.calibration`.
+Inputs: a fitted method and the product "stars" that it was fitted to. Output: a `StarModel`, which
+is saved as a bundle. Errors of the model are found in `psfdae.training.calibration`.
 """
 
 from __future__ import annotations
@@ -50,14 +50,17 @@ def build_model(
     Parameters
     ----------
     method_fit : Method
+        Fit to these stars.
     stars : product "stars"
         Stars of the fit.
     reference : "realisation" or "template"
-        What is restored.
+        Target of the denoising.
     config : settings (seed, noise, parts, evaluation)
+        Settings by which the model is tested.
     training_config : mapping
         Settings of the fit, and its "split".
     name, licence : str
+        Name and licence of the model.
     largest_mb : float, optional
         Size of the arrays, for which a mixture leaves out fine axes.
 
@@ -69,7 +72,7 @@ def build_model(
     bundle, model_stars = build_uncalibrated(
         method_fit, stars, reference, config, training_config, name, licence, largest_mb
     )
-    # Errors are those of the fit as it is packed.
+    # Errors are measured with the arrays as the bundle stores them.
     model = StarModel(bundle, estimator(bundle))
     errors, star_errors = calibrate_errors(model, method_fit, model_stars, config.seed)
     # Metrics of test stars at the noise levels of the configuration.
@@ -99,7 +102,7 @@ def build_uncalibrated(
 ) -> tuple[Bundle, ModelStars]:
     """Return a fit with all that it takes to apply it, but its errors, and the stars for these.
 
-    Parameters are those of `build_model`; of the settings, seed, noise and parts are enough.
+    Parameters are as for `build_model`; of the settings, seed, noise and parts are enough.
     `components` is the number of leading eigenvectors of the flux model that the bundle stores.
 
     Returns
@@ -107,18 +110,18 @@ def build_uncalibrated(
     bundle : Bundle
         Its errors are 0, and fluxes are measured as if the method knew every shape.
     model_stars : ModelStars
-        Those of the fit, and test stars, by which the errors are to be calibrated.
+        Training stars of the fit, and test stars, by which the errors are to be calibrated.
     """
     stamp_fields = _stamp_fields(stars)
     stamp_px = stamp_fields["stamp_px"]
-    model_stars = ModelStars.of(stars, training_config["split"], reference, config)
+    model_stars = ModelStars.select(stars, training_config["split"], reference, config)
     images, noise = model_stars.images, model_stars.held_out.noise
     # The flux model, its variance beyond the leading eigenvectors spread evenly.
     flux_model = leading(FluxModel.fit(images), components)
     # Range of noise, as pixel RMS over the flux, and of S/N.
     band, area = noise.kappa * np.asarray(config.noise.levels), model_stars.noise_equivalent_px
     least_noise, greatest_noise = float(band.min()), float(band.max())
-    arrays, method_fields = packed(method_fit, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
+    arrays, method_fields = pack(method_fit, stamp_px, least_noise, 1e6 * (largest_mb or np.inf))
     # Everything that is needed to apply the method, and to know what it was trained on.
     info = BundleInfo(
         psfdae_version=__version__,
@@ -178,15 +181,17 @@ def _stamp_fields(product: Product) -> dict[str, Any]:
         raise ProductError(f"{product.path}: its configuration lacks {error}") from None
 
 
-def packed(
+def pack(
     method_fit: Method, stamp_px: int, noise: float, largest: float
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return arrays of a fit for this noise, or for the least above it that takes few bytes.
+    """Return arrays of a fit for this noise, or for the least larger noise that takes few bytes.
 
     Parameters
     ----------
     method_fit : Method
+        Fitted method.
     stamp_px : int
+        Side of the stamps.
     noise : float
         Least pixel RMS over the flux that the arrays are for.
     largest : float
@@ -195,6 +200,7 @@ def packed(
     Returns
     -------
     arrays : dict of ndarray
+        Arrays of the method, by name.
     fields : dict
         Fields of `BundleInfo` that describe them.
 
@@ -203,7 +209,7 @@ def packed(
     BundleError
         If it takes more than the largest number of bytes in any case.
     """
-    # Steps of the noise up to that of the flux in every pixel.
+    # Steps of the noise up to a noise as large as the flux, in every pixel.
     count = 64
     # Axes that are finer than the noise cannot be seen: the more noise, the fewer bytes.
     noises = np.geomspace(noise, max(1.0, noise), count)
@@ -260,7 +266,9 @@ def metrics_by_level(
     Parameters
     ----------
     method_fit : Method
+        Fitted method, as the bundle stores it.
     stars : HeldOutStars
+        Test stars.
     noisy : iterable of (float, ndarray)
         Each λ with noisy images of all test stars, shape (n, d, d).
     errors : StarErrors

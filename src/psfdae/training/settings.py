@@ -38,7 +38,7 @@ DATASET_CHOICE = "dataset=from_stars"
 
 
 class Settings(Group):
-    """Settings of a training on the bright stars of an image, without those of the methods.
+    """Settings of a training on the bright stars of an image, without the settings of the methods.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Settings(Group):
     calibration_stars: CalibrationStars = CalibrationStars()
     framing: Stamp = Stamp()
     # With κ = 1 a noise level is the RMS of a pixel over the star's flux. The levels are replaced
-    # by those of the stated S/N, and the sky by that of the image where its gain is known.
+    # by the levels of the given S/N, and the sky by the image's sky if its gain is known.
     noise: Noise = Noise(name="from_stars", levels=[1e-2], kappa=1.0, background_photons=1e4)
     parts: Parts = Parts()
     evaluation: Evaluation = Evaluation()
@@ -76,8 +76,8 @@ class Settings(Group):
     @model_validator(mode="before")
     @classmethod
     def keep_stated_size(cls, tree: Any) -> Any:
-        """Keep a stated size of stamps: the light that they hold shall not change it."""
-        # What is no tree, or has a group that is none, is refused later with its key.
+        """Keep a given size of stamps: the light that they hold shall not change it."""
+        # A value or group that is not a mapping is rejected later with its key.
         if not isinstance(tree, Mapping) or not isinstance(tree.get("framing"), Mapping):
             return tree
         stars = tree.get("calibration_stars", {})
@@ -92,7 +92,7 @@ class Settings(Group):
 
 @cache
 def settings_model() -> type[Settings]:
-    """Return the class of all settings, those of all methods that are installed included."""
+    """Return the class of all settings, with the groups of all installed methods."""
     # A field of the class for each group of each method, by the name of the group.
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
@@ -176,14 +176,14 @@ def apply_keywords(
 ) -> Settings:
     """Return settings with other values, given by the names of keys of some groups.
 
-    A name that several of the groups have is that of the first one.
+    A name in several groups belongs to the first of them.
 
     Raises
     ------
     ConfigError
         If no group has a name, or a value is out of its range.
     """
-    # Only what was stated: a default may depend on it.
+    # Only given values: a default may depend on them.
     tree = settings.model_dump(exclude_unset=True)
     # A group without keys, such as the seed, is itself a key.
     group_keys = {group: _keys(group) or {group} for group in groups}
@@ -208,6 +208,6 @@ def apply_keywords(
 
 def _keys(group: str) -> set[str]:
     """Return the keys of a group of settings; none if it is a single value such as the seed."""
-    # The type of the group's field: a class of settings, or that of a number.
+    # The type of the group's field: a class of settings, or the type of a number.
     kind = settings_model().model_fields[group].annotation
     return {*kind.model_fields} if isinstance(kind, type) and issubclass(kind, Group) else set()

@@ -40,6 +40,7 @@ def choose_bright_stars(
     observations : sequence of Observation
         Images of one camera; their stars count together.
     settings : Settings
+        Limits of the choice, and sizes of the stamps.
 
     Returns
     -------
@@ -50,10 +51,10 @@ def choose_bright_stars(
     settings : Settings
         Settings by which the stars were chosen.
     notes : list of str
-        Lines on what differs from the stated settings.
+        Lines on differences from the given settings.
     """
     notes = []
-    # Choose stars in stamps of the stated size, then in larger ones if these hold too little of
+    # Choose stars in stamps of the given size, then in larger ones if these hold too little of
     # their light.
     relaxed_settings, candidates = collect_enough(observations, settings)
     if (enlarged_stamps := enlarge_stamps(observations, candidates, settings)) is not None:
@@ -64,7 +65,7 @@ def choose_bright_stars(
             replace(observation, stamp_px=side, margin=margin) for observation in observations
         ]
         relaxed_settings, candidates = collect_enough(observations, settings)
-    # The user learns that stars below the stated S/N take part.
+    # The user is warned that stars below the given S/N are used.
     least_snr, stated_snr = (
         s.calibration_stars.effective_snr_min for s in (relaxed_settings, settings)
     )
@@ -91,6 +92,7 @@ def collect_enough(
     observations : sequence of Observation
         Images of one camera; their stars count together.
     settings : Settings
+        Limits of the choice, which are relaxed where stars are few.
 
     Returns
     -------
@@ -116,7 +118,7 @@ def collect_enough(
         return sum(len(candidates.bright) for candidates in selection[1])
 
     selection = collect_all(snr_min=calibration.effective_snr_min)
-    # In an image of galaxies, fainter stars cannot be told from galaxies.
+    # In an image of galaxies, fainter stars cannot be distinguished from galaxies.
     verdicts = np.concatenate([image_candidates.verdict for image_candidates in selection[1]])
     has_galaxies = np.count_nonzero(verdicts == Verdict.EXTENDED) > max(9, bright_count(selection))
     if bright_count(selection) >= (MIN_STARS_WITH_ERROR if has_galaxies else ENOUGH_STARS):
@@ -127,11 +129,11 @@ def collect_enough(
         selection = max(selection, collect_all(snr_min=snr), key=bright_count)
         if bright_count(selection) >= (ENOUGH_STARS if snr <= 20.0 else 3 * ENOUGH_STARS):
             return selection
-    crowded = sum(np.count_nonzero(c.verdict == Verdict.CROWDED) for c in selection[1])
-    # Brighter neighbours; their brightness is that of their cores, since the stamp of a faint star
+    crowded_count = sum(np.count_nonzero(c.verdict == Verdict.CROWDED) for c in selection[1])
+    # Brighter neighbours; their brightness is taken from the cores, since the stamp of a faint star
     # has the light of a bright neighbour. The mean PSF is a median: of neighbours on all sides it
     # has little light.
-    for ratio in (0.05, 0.1, 0.2, 0.4) if crowded >= ENOUGH_STARS else ():
+    for ratio in (0.05, 0.1, 0.2, 0.4) if crowded_count >= ENOUGH_STARS else ():
         if bright_count(selection) < ENOUGH_STARS:
             limits = {"snr_min": calibration.effective_snr_min, "neighbour_ratio": ratio}
             selection = max(selection, collect_all(True, **limits), key=bright_count)
@@ -148,13 +150,16 @@ def enlarge_stamps(
     Parameters
     ----------
     observations : sequence of Observation
+        Images of one camera.
     candidates : sequence of Candidates
         Measured stars of each observation.
     settings : Settings
+        Sizes of the stamps, and the fraction of the light that they must hold.
 
     Returns
     -------
     settings : Settings
+        The adapted settings.
     note : str
         Size of the stars and of the stamps.
         None in place of both, if the stamps hold the light of the stars and these have their
@@ -163,16 +168,16 @@ def enlarge_stamps(
     Raises
     ------
     CalibrationStarsError
-        If the largest stamps hold less than 80 % of the light: the sources are no stars.
+        If the largest stamps hold less than 80 % of the light: the sources are not stars.
     """
     calibration, framing = settings.calibration_stars, settings.framing
-    # A stated size of stamps and a stated centring leave nothing to adapt.
+    # A given size of stamps and a given centring leave nothing to adapt.
     if not calibration.light_min and calibration.centring_px is not None:
         return None
     largest = _largest_size(observations, candidates, 0.8 if calibration.light_min else 0.0)
     if largest is None:
         return None
-    # The side of stamps that hold the stated part of the light, at least that of the settings.
+    # The side of stamps that hold the given part of the light, at least the side of the settings.
     side = framing.stamp_px
     if calibration.light_min:
         side = max(side, largest.side(calibration.light_min))
@@ -224,11 +229,12 @@ def enlarge_stamps(
 def _largest_size(
     observations: Sequence[Observation], candidates: Sequence[Candidates], light_min: float
 ) -> SourceSize | None:
-    """Return the size of stars in the image where it is largest; cubes of stamps tell none.
+    """Return the size of stars in the image where it is largest; None for cubes of stamps.
 
     Parameters
     ----------
     observations : sequence of Observation
+        Images of one camera, or cubes of stamps.
     candidates : sequence of Candidates
         Measured stars of each observation.
     light_min : float
@@ -258,16 +264,17 @@ def _largest_size(
 
 
 def few_stars_notes(rows: np.ndarray, held_out: np.ndarray) -> list[str]:
-    """Return notes on a model of few stars: none, or one line.
+    """Return notes on a model of few stars: an empty list, or one line.
 
     Errors of a model rest on the stars held out, a fifth of all: with fewer than 20 stars they are
-    rough, with fewer than 5 not stated.
+    rough, with fewer than 5 not given.
 
     Parameters
     ----------
     rows : ndarray of int, shape (n,)
         Row of each bright star in its list.
     held_out : ndarray of bool, shape (n,)
+        True for stars that no training sees.
     """
     count, test_count = len(rows), int(held_out.sum())
     if count >= ENOUGH_STARS:

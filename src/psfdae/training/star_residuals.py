@@ -22,7 +22,7 @@ from psfdae.training.settings import Settings
 
 
 def reject_misfits(candidates: Candidates, settings: Settings, gain: float | None) -> Candidates:
-    """Reject bright stars whose residuals about a fitted field are far beyond those of the others.
+    """Reject bright stars whose residuals about a fitted field are far larger than for the others.
 
     Fit and rejection are repeated until no star is rejected. The residual of a star is
 

@@ -1,7 +1,7 @@
 """Sets of stars, products of the kind "stars": split, noise, and what is made from them.
 
-In go a product and a configuration; out come the `TrainingSet` of a method, the `HeldOutStars` that
-test it, and the `ModelStars` from which a fit becomes a model.
+Inputs: a product and a configuration. Outputs: the `TrainingSet` of a method, the `HeldOutStars`
+that test it, and the `ModelStars` from which a model is built of a fit.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def read_stars(path: Path, *references: str) -> Product:
     return read_product(path, "stars", tuple(names))
 
 
-def of_image(stars: Product) -> bool:
-    """Return True if the stars are those of an image, not of a simulation."""
+def are_real(stars: Product) -> bool:
+    """Return True if the stars come from an image, not from a simulation."""
     return stars.config.get("source") == "stars"
 
 
@@ -41,11 +41,11 @@ def field_positions(stars: Product) -> np.ndarray:
     -------
     ndarray, shape (n, 2) or (n, 4)
         Simulated stars: steps of the field's grid. Stars of an image: pixels, magnitude and colour
-        of the bright star, which stay those of its noisy images; NaN where the list lacks them.
+        of the bright star, which its noisy images share; NaN where the list lacks them.
     """
     # Rows of fields, or of bright stars; each has several images.
     position = stars["grid"]
-    if of_image(stars):
+    if are_real(stars):
         position = places(stars["position"], stars["flux"], stars["colour"])
     return np.asarray(position[stars["field_index"]])
 
@@ -56,11 +56,12 @@ def star_area(stars: Product, train: np.ndarray) -> float:
     Parameters
     ----------
     stars : product "stars"
+        Images of stars with their noise-free truth.
     train : ndarray of int
-        Numbers of the training images, whose mean area is that of simulated stars.
+        Numbers of the training images, whose mean gives the area of simulated stars.
     """
     # Bright stars of an image have a measured S/N = F / (σ √A), with σ / F as their noise.
-    if of_image(stars):
+    if are_real(stars):
         return float(np.median((stars["noise"] * stars["snr"]) ** -2.0))
     return noise_equivalent_px(stars["realisation"][train])
 
@@ -71,9 +72,11 @@ def split_stars(stars: Product, kind: str, config: OfFit) -> Split:
     Parameters
     ----------
     stars : product "stars"
+        Images of stars with their noise-free truth.
     kind : str
         "held_out" for whole field positions, else at random.
     config : settings with the groups `parts` and `seed`
+        Numbers of stars of each part, and the seed of the draw.
 
     Raises
     ------
@@ -108,10 +111,13 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
     Parameters
     ----------
     config : settings with the groups `noise` and `seed`
+        Noise model, and the seed of the draw.
     stars : product "stars"
+        Images of stars with their noise-free truth.
     test : ndarray of int, shape (n,)
         Numbers of the images in the product.
     level : float
+        λ > 0, the noise level in units of the training (`psfdae.base.settings.Noise`).
     """
     set_name = stars.config.get("stars", {}).get("name", "own")
     # Six digits of λ: the same level from two files may differ in the last bit.
@@ -122,12 +128,14 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
 def own_noise(
     stars: Product, images: np.ndarray, background: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise of bright stars themselves, in images of flux 1; simulated stars have none.
+    """Return the noise of bright stars themselves, in images of flux 1; 0 for simulated stars.
 
     Parameters
     ----------
     stars : product "stars"
+        Product to which the images belong.
     images : ndarray, shape (n, d, d)
+        Images of flux 1.
     background : float
         Photons B of the sky in a pixel.
 
@@ -139,7 +147,7 @@ def own_noise(
     sigma : ndarray, shape (n, d, d)
         Standard error of each pixel, from the noise of the sky and the photons of the star.
     """
-    if not of_image(stars):
+    if not are_real(stars):
         return np.zeros(len(images)), np.broadcast_to(np.float32(0.0), images.shape)
     # A star of F = √B / σ photons has the variance σ² + x / F = σ² + x σ / √B in a pixel x.
     noise = stars["noise"][stars["field_index"]]
@@ -167,7 +175,7 @@ class HeldOutStars:
         What is to be restored of them.
     noise : NoiseModel
     position : ndarray, shape (n, 2) or (n, 4)
-        Places; those of an image's stars have magnitudes and colours, too.
+        Positions; with magnitudes and colours for stars of an image.
     flux_error : ndarray, shape (n,)
         Error of the flux, which is taken to be 1, due to noise in the image.
     own_noise : ndarray, shape (n, d, d)
@@ -184,7 +192,7 @@ class HeldOutStars:
     min_images: ClassVar[int] = 250
 
     @classmethod
-    def of(
+    def select(
         cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
     ) -> HeldOutStars:
         """Return some stars of a product "stars", by their indices."""
@@ -212,6 +220,7 @@ class HeldOutStars:
         Parameters
         ----------
         psf : ndarray, shape (n, d, d)
+            Denoised PSFs of flux 1.
         star : ndarray of int, shape (n,), or slice
             Star of every PSF.
         unit : ndarray, shape (n, d, d), optional
@@ -220,7 +229,7 @@ class HeldOutStars:
         Returns
         -------
         ndarray, shape (n, d, d)
-            At least 0. Quantiles above the own noise are those of errors to noise-free stars; means
+            At least 0. Quantiles above the own noise are as for errors to noise-free stars; means
             are larger.
         """
         # The own noise s of a pixel is independent of the error e: the difference from the
@@ -241,7 +250,7 @@ class ModelStars:
     images, references : ndarray, shape (n, d, d)
         Training images of flux 1, and what is to be restored of them.
     stars : ndarray of int, shape (m,)
-        Numbers of the training stars; those of an image have several images each.
+        Numbers of the training stars; a star of an image has several images.
     held_out : HeldOutStars
         Test stars.
     test : ndarray of int
@@ -259,16 +268,16 @@ class ModelStars:
     noise_equivalent_px: float
 
     @classmethod
-    def of(cls, stars: Product, split_kind: str, reference: str, config: OfFit) -> ModelStars:
+    def select(cls, stars: Product, split_kind: str, reference: str, config: OfFit) -> ModelStars:
         """Return the parts of a product "stars", as `training_set` and `HeldOutStars` do."""
         parts = split_stars(stars, split_kind, config)
-        numbers = np.unique(stars["field_index"][parts.train]) if of_image(stars) else parts.train
+        numbers = np.unique(stars["field_index"][parts.train]) if are_real(stars) else parts.train
         return cls(
             stars,
             stars["realisation"][parts.train],
             stars[reference][parts.train],
             numbers,
-            HeldOutStars.of(stars, reference, noise_model(config), parts.test),
+            HeldOutStars.select(stars, reference, noise_model(config), parts.test),
             parts.test,
             star_area(stars, parts.train),
         )
@@ -276,7 +285,7 @@ class ModelStars:
     @property
     def bright(self) -> BrightStars | None:
         """The training stars of an image with the pixels around them; None if simulated."""
-        return BrightStars.read(self.product).select(self.stars) if of_image(self.product) else None
+        return BrightStars.read(self.product).select(self.stars) if are_real(self.product) else None
 
 
 def training_set(
@@ -287,9 +296,11 @@ def training_set(
     Parameters
     ----------
     config : settings with the groups `noise`, `parts` and `seed`
+        Noise levels, numbers of stars of each part, and seed.
     kind : type of Method
         Method to be fitted.
     stars : product "stars"
+        Images of stars with their noise-free truth.
     split : str
         Kind of the split, as of `split_stars`.
     reference : str
@@ -306,7 +317,7 @@ def training_set(
     # Stars of an image have noise themselves, and some methods measure them in the image; simulated
     # stars have a description of their simulation.
     parts, positions = split_stars(stars, split, config), field_positions(stars)
-    if of_image(stars):
+    if are_real(stars):
         fields["own_noise"] = star_noise
         if kind.knows_field:
             fields |= {"bright": BrightStars.read(stars), "star": stars["field_index"]}
@@ -327,15 +338,18 @@ def training_set(
 
 
 def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Config) -> Method:
-    """Fit a method without the validation stars, for methods that otherwise learn from them.
+    """Fit a method without the validation stars, for methods that otherwise train on them.
 
     Parameters
     ----------
     kind : type of Method
+        Class of the method.
     data : TrainingSet
+        Images with their training and validation parts.
     star : ndarray of int, shape (n,)
         Number of the star of each image.
     config : settings of the method
+        Groups of settings that `Method.fit` takes.
     """
     # A tenth of the stars of the fit choose its settings in place of the validation stars.
     is_judge = np.isin(star[data.fit], np.unique(star[data.fit])[::10])

@@ -34,12 +34,12 @@ from psfdae.training.star_sets import split_stars, training_set
 class ImageStars:
     """Bright stars of an image, and the images for the training and the test of methods.
 
-    Stars of several exposures are one set; `exposures` has those of each.
+    Stars of several exposures are one set; `exposures` has the stars of each.
 
     Attributes
     ----------
     source : ImageInput
-        The image, and what was stated about it; of several, the first one.
+        The image with its list and options; of several, the first one.
     observation : Observation
         The image with all of its stars; of several, the first one under a name for all.
     candidates : Candidates
@@ -130,7 +130,7 @@ class ImageStars:
 
     @property
     def name(self) -> str:
-        """Default name of a model of these stars: that of the image, or "all" of several."""
+        """Default name of a model of these stars: the image's name, or "all" of several."""
         return "all" if self.exposures else self.source.name
 
     def replace_settings(self, settings: Settings) -> ImageStars:
@@ -215,7 +215,9 @@ def select_stars(
     Parameters
     ----------
     source : ImageInput
+        Image and list from which the observation was opened.
     observation : Observation
+        The opened image, with its stars.
     candidates : Candidates
         Measured stars of the observation.
     settings : Settings
@@ -289,14 +291,16 @@ def join_stars(exposures: Sequence[ImageStars]) -> ImageStars:
 
 
 def degrade_levels(settings: Settings, bright: BrightStars, sky_photons: float) -> Settings:
-    """Return settings with the noise levels λ of the stated S/N, for noise-free stars of flux 1.
+    """Return settings with the noise levels λ of the given S/N, for noise-free stars of flux 1.
 
     S/N = 1 / (κ λ √A), with A the median noise-equivalent area of the bright stars.
 
     Parameters
     ----------
     settings : Settings
+        Settings with `snr_levels`.
     bright : BrightStars
+        Stars to be degraded.
     sky_photons : float
         Photons of the sky in a pixel.
     """

@@ -1,1 +1,1 @@
-"""Best possible estimates: what no estimator can beat, and what the ideal one reaches."""
+"""Lower bounds of the error: the ideal estimator, which no other estimator can beat."""

@@ -19,10 +19,10 @@ from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     PosteriorSums,
-    groups_by_field,
-    jittered_templates,
-    nested_means,
-    posterior_sums,
+    average_nested,
+    cut_templates,
+    group_by_field,
+    sum_posterior,
 )
 from psfdae_paper.bounds.sampling import SampledPosterior, sample_posterior
 from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
@@ -38,7 +38,7 @@ SPLIT = "random"
 ENOUGH_ESS = 50.0
 """Effective sample size below which a star gets importance samples of its own.
 
-The error of a mean over so many samples is 2 % above that of the exact mean.
+The error of a mean over so many samples is 2 % larger than the error of the exact mean.
 """
 
 
@@ -68,10 +68,10 @@ class BoundedStars:
         return BoundedStars(self.star[stars], self.field[stars], truth, noisy)
 
 
-def bounded_stars(config: Config, product: Product) -> BoundedStars:
+def read_test_stars(config: Config, product: Product) -> BoundedStars:
     """Read the first test stars of a product "stars", with the noise of their datasets."""
-    # Errors of bounds and methods are compared star by star: stars and noise are those of the stage
-    # `evaluate`.
+    # Errors of bounds and methods are compared star by star: stars and noise are the same as in the
+    # stage `evaluate`.
     star = split_stars(product, SPLIT, config).test[: config.bounds.test_stars]
     return BoundedStars(
         star=star,
@@ -83,14 +83,15 @@ def bounded_stars(config: Config, product: Product) -> BoundedStars:
 
 @dataclass(frozen=True)
 class Estimates:
-    """Errors and variances of one posterior mean; rows are those of `star_measures`.
+    """Errors and variances of one posterior mean, in the rows of `measure_posteriors`.
 
     Attributes
     ----------
     full, quarter : ndarray, shape (5, n)
-        Measures of the mean over all samples, and of those over a quarter of them.
+        Measures of the mean over all samples, and of the mean over a quarter of them.
     with_truth : ndarray, shape (5, n)
-        Measures of the mean over all samples and those around modes that only the truth leads to.
+        Measures of the mean over all samples, including samples around modes that are reached
+        only from the truth.
     """
 
     full: np.ndarray
@@ -98,21 +99,21 @@ class Estimates:
     with_truth: np.ndarray
 
     @classmethod
-    def over_bank(cls, measures: dict[int, np.ndarray]) -> Estimates:
+    def from_bank(cls, measures: dict[int, np.ndarray]) -> Estimates:
         """Return the estimates of `weigh_bank`, whose numbers of draws double."""
-        # A quarter is two doublings before the last; a bank has no modes from the truth.
-        nested = list(measures.values())
-        quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
-        return cls(nested[-1], quarter, nested[-1])
+        # A quarter is two doublings before the last; the truth adds nothing to a bank.
+        doublings = list(measures.values())
+        quarter = doublings[-3] if len(doublings) > 2 else np.full_like(doublings[-1], np.nan)
+        return cls(doublings[-1], quarter, doublings[-1])
 
     @classmethod
-    def over_samples(
+    def from_samples(
         cls, samples: SampledPosterior, static: np.ndarray, stars: BoundedStars
     ) -> Estimates:
         """Return the estimates of importance samples, which are in four parts."""
-        measure = partial(star_measures, static=static, stars=stars)
+        measure = partial(measure_posteriors, static=static, stars=stars)
         # Four parts give means over a quarter, a half and all of the samples.
-        quarter, _, full = nested_means(samples.parts, measure).values()
+        quarter, _, full = average_nested(samples.parts, measure).values()
         return cls(full, quarter, measure(samples.with_truth))
 
     @property
@@ -120,8 +121,8 @@ class Estimates:
         """Effective sample size of every star."""
         return np.asarray(self.full[-1])
 
-    def improved(self, stars: np.ndarray, samples: Estimates | None) -> tuple[Estimates, int]:
-        """Replace estimates over a bank by those over importance samples where these are larger.
+    def replace_sparse(self, stars: np.ndarray, samples: Estimates | None) -> tuple[Estimates, int]:
+        """Replace estimates over a bank by importance samples where these are larger.
 
         Parameters
         ----------
@@ -133,8 +134,9 @@ class Estimates:
         Returns
         -------
         estimates : Estimates
+            Of each star, the estimate with the larger effective sample size.
         replaced : int
-            Number of stars with another estimate.
+            Number of stars whose estimate was replaced.
         """
         if samples is None:
             return self, 0
@@ -152,7 +154,7 @@ class Estimates:
 
     def evidence(self, number: int, field: np.ndarray) -> Evidence:
         """Collect the evidence that the mean by one reference is near the exact one."""
-        return Evidence.of(
+        return Evidence.from_errors(
             **self.values(number),
             field=field,
             last_change=abs(_relative_change(self.quarter[number], self.full[number])),
@@ -162,29 +164,35 @@ class Estimates:
 
 def _relative_change(errors: np.ndarray, full: np.ndarray) -> float:
     """Return the relative difference of mean errors, over the stars that have both."""
-    # Means over the same stars: those of which neither estimate is missing.
+    # Means over the same stars, for which both estimates exist.
     has_both = np.isfinite(errors) & np.isfinite(full)
     if not has_both.any():
         return float("nan")
     return float(errors[has_both].mean() / full[has_both].mean() - 1.0)
 
 
-def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> dict[str, Column]:
-    """Simulate stars that no product "stars" has, framed so that they can be mirrored.
+def simulate_fresh_stars(
+    config: Config, suffix: str, count: int, threads: int = 1
+) -> dict[str, Column]:
+    """Simulate stars that are not in any product "stars", framed so that they can be mirrored.
 
     Parameters
     ----------
-    config : config with the groups of `consistency.SIMULATION`
+    config : Config
+        Settings with the groups of `consistency.SIMULATION`.
     suffix : str
         Name of the set of stars; each name gives other stars.
-    count, threads : int
+    count : int
+        Number of stars.
+    threads : int
+        Threads of the propagation.
 
     Returns
     -------
     dict of Column
         Framed images, fields, brightest pixels, aberrations and pupil samples of the stars.
     """
-    # Another name gives other random streams: no training or test star is among them.
+    # Another name gives other random streams: the stars are independent of training and test.
     changes = {"name": f"{config.stars.name}_{suffix}", "count": count}
     config = config.model_copy(update={"stars": config.stars.model_copy(update=changes)})
     rng = stream(config.seed, "field", config.stars.name)
@@ -192,7 +200,7 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     star_field = assign_fields(count, config.grid.points**2, rng)
     source = star_wavefronts(config, star_field)
     # Smaller pupil grids than for training stars where the sampling guard allows them: stamps of
-    # scene 1 differ from those of N = 222 by an MSE of 4e-11 at most, below any noise of the
+    # scene 1 differ from stamps with N = 222 by an MSE of 4e-11 at most, below any noise of the
     # datasets, and take half the time.
     grid_sizes = sorted({158, 190, *config.optics.pupil_samples})
     optics = config.optics.model_copy(update={"pupil_samples": grid_sizes, "threads": threads})
@@ -200,10 +208,10 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     propagation = Propagation(source, config.telescope, optics, framing, config.stars.search_px)
     # Framed without centring error, with a margin from which all errors and mirror images are cut.
     margin = framing.jitter_px + Bank.mirror_margin
-    framed, peak = propagation.framed(framing.stamp_px + 2 * margin)
+    frames, peak = propagation.framed(framing.stamp_px + 2 * margin)
     return {
         "framed": Column(
-            framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
+            frames.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
         ),
         "field_index": Column(star_field, "1", "field of the star"),
         "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
@@ -212,24 +220,24 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
     }
 
 
-def static_psfs(config: Config) -> np.ndarray:
+def propagate_static_psfs(config: Config) -> np.ndarray:
     """Propagate static PSFs of all fields at all centring errors, (F, J, d, d), as "templates"."""
     framing = config.framing
     propagation = Propagation(
         template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
     )
     # Framed with a margin of the largest centring error; then cut at every error.
-    framed, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
-    return jittered_templates(framed.astype(np.float32), framing.jitter_px)
+    frames, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
+    return cut_templates(frames.astype(np.float32), framing.jitter_px)
 
 
-def stamp_model(config: Config) -> StampModel:
-    """Make the model of a dataset's stamps as functions of their Seidel coefficients.
+def build_stamp_model(config: Config) -> StampModel:
+    """Build the model of a dataset's stamps as functions of their Seidel coefficients.
 
     Raises
     ------
     ConfigError
-        If their aberrations are no Seidel terms.
+        If the aberrations are not Seidel terms.
     """
     if not isinstance(config.wavefront, Seidel):
         raise ConfigError(f"wavefront.kind = {config.wavefront.kind}: must be seidel")
@@ -240,16 +248,16 @@ def stamp_model(config: Config) -> StampModel:
     return StampModel(mean, sd, field, config.telescope, config.optics, config.framing)
 
 
-def true_modes(model: StampModel, product: Product, stars: BoundedStars) -> Modes:
-    """Return the places at which the stars of a product were simulated."""
+def get_true_modes(model: StampModel, product: Product, stars: BoundedStars) -> Modes:
+    """Return the true field, offset and coefficients of the stars of a product."""
     count = stars.star.size
-    return Modes.at(
+    return Modes.make_starts(
         np.arange(count),
         stars.field,
         # The middle of a stamp is the framed pixel less the centring error.
         product["peak"][stars.star] - product["jitter"][stars.star],
         np.full(count, Knowledge.TRUTH),
-        model.standardised(product["seidel"][stars.star]),
+        model.standardise(product["seidel"][stars.star]),
     )
 
 
@@ -263,12 +271,12 @@ def sample_stars(
 ) -> tuple[SampledPosterior, SampledPosterior]:
     """Draw importance samples around the modes of every star, from a stream of its own.
 
-    They are returned for an unknown and for a known field.
+    The samples are returned for an unknown and for a known field.
     """
-    posteriors = StarPosteriors(stars.noisy[level], likelihood, stamp_model(config))
-    # Bounds need every mode: more starts than a method takes, and more for doubtful stars.
+    posteriors = StarPosteriors(stars.noisy[level], likelihood, build_stamp_model(config))
+    # Bounds need every mode: more starts than in a method, and more for doubtful stars.
     modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=2.0)
-    modes = separate(modes + climb(true_modes(posteriors.model, product, stars), posteriors))
+    modes = separate(modes + climb(get_true_modes(posteriors.model, product, stars), posteriors))
     # A star's draws do not depend on the other stars: each has a stream by its number.
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
@@ -283,16 +291,18 @@ def weigh_bank(
     level: float,
     likelihood: Likelihood,
 ) -> dict[int, np.ndarray]:
-    """Measure the posterior mean over a bank, and over halves, quarters … of it.
+    """Measure the posterior means over a bank, and over halves, quarters … of it.
 
     Parameters
     ----------
     bank : Bank
+        M simulated stars, samples of the prior.
     field_is_known : bool
         True for the posterior given the star's field.
     static : ndarray, shape (F, J, d, d)
         Static PSFs at all centring errors.
     stars : BoundedStars
+        Test stars with their noisy images.
     level : float
         Noise level λ.
     likelihood : Likelihood
@@ -301,10 +311,10 @@ def weigh_bank(
     Returns
     -------
     dict of int to ndarray, shape (5, n)
-        `star_measures` by number of draws, ascending. Every part of the bank has as many draws of
-        every group of fields; counted are the draws in all fields.
+        `measure_posteriors` by number of draws in all fields, ascending. All parts of the bank have
+        the same number of draws of every group of fields.
     """
-    groups = groups_by_field(stars.star.size, stars.field if field_is_known else None, bank)
+    groups = group_by_field(stars.star.size, stars.field if field_is_known else None, bank)
     # Equal parts of the bank: the largest power of two up to 16 and the size of a group.
     pieces = 1 << (min(16, *(members.size for _, members in groups)).bit_length() - 1)
     quarter = max(1, pieces // 4)
@@ -314,28 +324,28 @@ def weigh_bank(
         # Sums over each part of the bank; parts are merged to banks of all sizes.
         field = subset.field if field_is_known else None
         return [
-            posterior_sums(bank.take(cut), subset.noisy[level], likelihood, star_field=field)
-            for cut in cuts
+            sum_posterior(bank.take(numbers), subset.noisy[level], likelihood, star_field=field)
+            for numbers in cuts
         ]
 
     # A quarter first. Where it has an effective sample size below 2 in the median, the rest of the
     # bank would not be enough either.
     parts = [weigh(subset, cuts[:quarter]) for subset, cuts in subsets]
-    sizes = [nested_means(part, lambda sums: sums.effective_size)[quarter] for part in parts]
+    sizes = [average_nested(part, lambda sums: sums.effective_size)[quarter] for part in parts]
     if np.median(np.concatenate(sizes)) >= 2.0:
         for part, (subset, cuts) in zip(parts, subsets, strict=True):
             part.extend(weigh(subset, cuts[quarter:]))
     # Each group has the columns of its stars.
     measures: dict[int, np.ndarray] = {}
     for (group, _), (subset, _), part in zip(groups, subsets, parts, strict=True):
-        measure = partial(star_measures, static=static, stars=subset)
-        for size, values in nested_means(part, measure).items():
+        measure = partial(measure_posteriors, static=static, stars=subset)
+        for size, values in average_nested(part, measure).items():
             draws = round(len(bank) / pieces * size)
             measures.setdefault(draws, np.empty((len(values), stars.star.size)))[:, group] = values
     return measures
 
 
-def star_measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
+def measure_posteriors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
     """Measure posterior means of stars against the truth.
 
     Returns
@@ -343,7 +353,7 @@ def star_measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) 
     ndarray, shape (5, n)
         MSE against realisation and template, posterior variances of both, effective sample size.
     """
-    # The posterior has the mean of the noise-free image, and that of the static PSF.
+    # Posterior means of the noise-free image and of the static PSF.
     shape = stars.truth["realisation"].shape
     template, template_variance = sums.template(static)
     means = {"realisation": sums.mean_image, "template": template}

@@ -1,11 +1,11 @@
 """Local error floor of a star image whose field, centring and frame are known.
 
-Then only the Seidel coefficients c are open. Near the true ones the image is
-linear in c, p(c + δ) ≈ p + Jδ, and the posterior covariance of c is that of a
-linear Gaussian problem, (JᵀΣ⁻¹J + P⁻¹)⁻¹ with noise covariance Σ and prior
-covariance P (e.g. Kay 1993, Fundamentals of Statistical Signal Processing:
-Estimation Theory, chapter 11). It is a local approximation and no lower limit: where the
-image bends within the width of the posterior, the posterior mean can lie below it.
+Then only the Seidel coefficients c are unknown. Near their true values the image is
+linear in c, p(c + δ) ≈ p + Jδ. As in any linear Gaussian problem, the posterior
+covariance of c is (JᵀΣ⁻¹J + P⁻¹)⁻¹ with noise covariance Σ and prior covariance P
+(e.g. Kay 1993, Fundamentals of Statistical Signal Processing: Estimation Theory,
+chapter 11). It is a local approximation and not a lower limit: where the image is not
+linear within the width of the posterior, the posterior mean can have a smaller error.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import numpy as np
 from psfdae.methods.metrics import cluster_mean
 
 
-def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def compute_local_error(
+    derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray
+) -> np.ndarray:
     """Compute tr[J (JᵀΣ⁻¹J + P⁻¹)⁻¹ Jᵀ] / N_pix of every star.
 
-    Coefficients are counted in their prior standard deviations, P = 1, so that a
+    Coefficients are in units of their prior standard deviations, P = 1, so that a
     term that cannot vary drops out instead of dividing by zero.
 
     Parameters
@@ -39,8 +41,8 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     """
     jacobian = derivatives * prior_sd[:, None]
     # Inverse of the posterior covariance, JᵀΣ⁻¹J + 1.
-    weighted = jacobian / variance[:, None]
-    information = weighted @ jacobian.swapaxes(1, 2) + np.eye(len(prior_sd))
+    weighted_jacobian = jacobian / variance[:, None]
+    information = weighted_jacobian @ jacobian.swapaxes(1, 2) + np.eye(len(prior_sd))
     # The trace does not change if its factors rotate: tr[(JᵀΣ⁻¹J + 1)⁻¹ JᵀJ].
     square = jacobian @ jacobian.swapaxes(1, 2)
     trace = np.trace(np.linalg.solve(information, square), axis1=1, axis2=2)
@@ -49,7 +51,7 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
 
 @dataclass(frozen=True)
 class Comparison:
-    """An estimator's errors beside a bound, over the same stars.
+    """An estimator's errors compared with a bound, over the same stars.
 
     Attributes
     ----------
@@ -68,7 +70,7 @@ class Comparison:
     tolerance: float = 0.05
 
     @classmethod
-    def paired(
+    def from_pairs(
         cls, errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = tolerance
     ) -> Comparison:
         """Compare squared errors and bounds of the same stars, which lie in `field`, all (n,)."""

@@ -20,12 +20,13 @@ class Mixture:
     Attributes
     ----------
     mean : ndarray, shape (M, D)
+        Centre of each component.
     factor : ndarray, shape (M, D, D)
         Lower Cholesky factor L of each scale matrix.
     evidence : ndarray, shape (M,)
         Logarithm of the mass of each mode.
     freedom : float
-        Degrees of freedom ν; the tails are heavier than those of any normal posterior.
+        Degrees of freedom ν; the tails are heavier than the tails of any normal posterior.
     """
 
     mean: np.ndarray
@@ -33,7 +34,7 @@ class Mixture:
     evidence: np.ndarray
     freedom: ClassVar[float] = 5.0
 
-    def squared_distance(self, draws: np.ndarray) -> np.ndarray:
+    def compute_squared_distance(self, draws: np.ndarray) -> np.ndarray:
         """Return (x − μ)ᵀ (LLᵀ)⁻¹ (x − μ) of draws x (n, D) from every mode, shape (M, n)."""
         # With L u = x − μ the squared distance is |u|².
         offset = np.linalg.solve(self.factor, (draws - self.mean[:, None]).swapaxes(1, 2))
@@ -61,17 +62,18 @@ class Mixture:
         offset = (self.factor[mode] @ (normal * stretch[:, None])[:, :, None])[:, :, 0]
         return np.asarray(self.mean[mode] + offset)
 
-    def adapted(
+    def adapt(
         self, draws: np.ndarray, log_weight: np.ndarray, log_possible: np.ndarray | float = 0.0
     ) -> Mixture:
         """Return the mixture with means, scales and masses of weighted draws.
 
-        One step of expectation maximisation for Student's t. The mixture is returned as it is if
-        no draw is possible.
+        One step of expectation maximisation for Student's t. The mixture is returned unchanged if
+        all draws are impossible.
 
         Parameters
         ----------
         draws : ndarray, shape (n, D)
+            Coefficients of every draw.
         log_weight : ndarray, shape (n,)
             Logarithm of the importance weights.
         log_possible : ndarray, shape (M, n)
@@ -80,7 +82,7 @@ class Mixture:
         if not np.isfinite(log_weight).any():
             return self
         smallest = np.finfo(float).tiny
-        squared_distance, terms = self.squared_distance(draws), self.mean.shape[1]
+        squared_distance, terms = self.compute_squared_distance(draws), self.mean.shape[1]
         # Responsibility of each component for each draw, times the weight of the draw.
         log_part = self.log_density(squared_distance) + log_possible + self.evidence[:, None]
         weight = np.exp(log_weight - log_weight.max())

@@ -1,9 +1,10 @@
 """Search for the modes of stars' posteriors, where the bank has too few stars that resemble them.
 
-In go noisy stars and a bank of simulated ones; out come the fields, offsets and aberrations that
-explain each star. The unknowns of a star are its field f, the offset o in pixels from the chief ray
-to the middle of its stamp, and the Seidel coefficients c. For one (f, o) the image is smooth in c,
-so a mode of the posterior is sought by Gauss–Newton steps from the bank's best matches.
+The input is noisy stars and a bank of simulated stars, the output the fields, offsets and
+aberrations that explain each star. The unknowns of a star are its field f, the offset o in pixels
+from the chief ray to the middle of its stamp, and the Seidel coefficients c. For one (f, o) the
+image is smooth in c: a mode of the posterior is searched by Gauss–Newton steps from the bank's best
+matches.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from psfdae.optics.wavefronts import MONOMIALS
 from psfdae.sensing.climbing import Peaks, Steps, poisson_information
 from psfdae.sensing.climbing import climb as climb_posterior
-from psfdae_paper.bounds.modes import Knowledge, Modes, largest_of_groups, separate
-from psfdae_paper.bounds.posterior import Bank, groups_by_field, jitters, score_bank
+from psfdae_paper.bounds.modes import Knowledge, Modes, select_largest, separate
+from psfdae_paper.bounds.posterior import Bank, group_by_field, list_jitters, score_bank
 from psfdae_paper.bounds.stamp_model import StarPosteriors
 from psfdae_paper.stars.symmetry import SYMMETRIES
 
@@ -34,40 +35,42 @@ def search(
 ) -> tuple[Modes, np.ndarray]:
     """Search the modes of stars, without knowledge of them or with their fields known.
 
-    Climbs begin at the bank's best matches, as they are and recentred. Stars that no mode explains
-    get more of them, and then starts all around their best modes.
+    Climbs start at the bank's best matches, unchanged and recentred. Stars that are not explained
+    by any mode get more of these starts, and then starts all around their best modes.
 
     Parameters
     ----------
     bank : Bank
+        Simulated stars among which the best matches are searched.
     posteriors : StarPosteriors
+        Noisy images and likelihood of the n stars, and the model of their stamps.
     star_field : ndarray of int, shape (n,), optional
-        Fields of the stars, in which modes are sought, too.
+        Fields of the stars, in which modes are searched in addition.
     in_all_fields : bool
-        True if modes are sought in all fields.
+        True if modes are searched in all fields.
     fields : int
-        Fields with the best matches, in which modes are sought.
+        Number of fields with the best matches, in which modes are searched.
     offsets : int
-        Offsets with the best matches in the star's own field, if it is known.
+        Number of offsets with the best matches in the star's own field, if it is known.
     misfit_sigma : float
-        Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
-        for more modes to be sought. Chance alone makes a few in a thousand, with 2 one in forty.
+        More modes are searched if χ² of a star's best mode exceeds its expectation by this many
+        standard deviations. By chance this happens for a few stars in 1000; with 2, for 1 in 40.
 
     Returns
     -------
     modes : Modes
         At least one for every star.
-    missed : ndarray of int
-        Stars that none of the modes explains (`unexplained`).
+    misfits : ndarray of int
+        Stars that are not explained by any mode (`find_unexplained`).
     """
 
     def bank_starts(stars: np.ndarray, fields: int, offsets: int) -> Modes:
-        """Return the best matches of the stars with these numbers, as they are and recentred."""
+        """Return the best matches of the stars with these numbers, unchanged and recentred."""
         field = None if star_field is None else star_field[stars]
         matches = []
         # Stars of one group share the part of the bank that may explain them.
-        for group, members in groups_by_field(stars.size, None if in_all_fields else field, bank):
-            in_group = best_matches(
+        for group, members in group_by_field(stars.size, None if in_all_fields else field, bank):
+            in_group = find_best_matches(
                 bank.take(members),
                 posteriors.take(stars[group]),
                 fields if in_all_fields else 0,
@@ -80,41 +83,45 @@ def search(
 
     # First from a few matches of every star.
     modes = climb(bank_starts(np.arange(len(posteriors.noisy)), fields, offsets), posteriors)
-    # Then from 16 fields or offsets of stars that the modes do not explain, and twice from all
-    # around the best modes of those that still are not.
+    # Then from 16 fields or offsets for stars that the modes do not explain, and twice from all
+    # around the best modes of stars that are still not explained.
     for attempt in range(3):
-        missed = unexplained(modes, posteriors, misfit_sigma)
-        if not missed.size:
+        misfits = find_unexplained(modes, posteriors, misfit_sigma)
+        if not misfits.size:
             break
         if attempt == 0:
-            starts = bank_starts(missed, 16, 16)
+            starts = bank_starts(misfits, 16, 16)
         else:
-            starts = recentre(corners(modes, missed), posteriors)
+            starts = recentre(place_corners(modes, misfits), posteriors)
         modes = climb(modes + starts, posteriors)
-    # Last in other fields and at other offsets that give nearly the same image as the best modes.
+    # Finally in other fields and at other offsets that give nearly the same image.
     if in_all_fields:
         modes = climb(modes + find_twins(modes, posteriors), posteriors)
-    # χ² four standard deviations above its mean: the star has no mode that explains it.
-    return modes, unexplained(modes, posteriors, 4.0)
+    # χ² four standard deviations above its mean: no mode explains the star.
+    return modes, find_unexplained(modes, posteriors, 4.0)
 
 
-def best_matches(
+def find_best_matches(
     bank: Bank, posteriors: StarPosteriors, fields: int, offsets: int, star_field: np.ndarray | None
 ) -> Modes:
     """Find the best star of the bank in each of the best `fields` of every image.
 
-    If the stars' fields are known, the best at each of so many `offsets` in its own field
+    If the stars' fields are known, the best match at each of the best `offsets` in its own field
     is added for every star. Mirrored stars keep their coefficients.
 
     Parameters
     ----------
     bank : Bank
+        Simulated stars among which the matches are searched.
     posteriors : StarPosteriors
+        Noisy images and likelihood of the n stars, and the model of their stamps.
     fields, offsets : int
+        Number of matches per star in any field, and in its own field.
     star_field : ndarray of int, shape (n,), optional
+        True field of every star, if it is known.
     """
     # Best score, and star of the bank that has it, by image, field and frame (symmetry, jitter).
-    shifts, images = np.array(jitters(bank.jitter_px)), np.arange(len(posteriors.noisy))
+    shifts, images = np.array(list_jitters(bank.jitter_px)), np.arange(len(posteriors.noisy))
     shape = (images.size, bank.points**2, len(SYMMETRIES) * len(shifts))
     best_score, best_star = np.full(shape, -np.inf), np.zeros(shape, int)
     for part in score_bank(bank, posteriors.noisy, posteriors.likelihood):
@@ -139,34 +146,39 @@ def best_matches(
             continue
         # In the star's own field, the best frame at each offset.
         field = star_field[star]
-        used: set[tuple[int, ...]] = set()
+        used_offsets: set[tuple[int, ...]] = set()
         for frame in np.argsort(-scores[field], kind="stable"):
             offset = tuple(middle[best_star[star, field, frame], frame])
-            if np.isfinite(scores[field, frame]) and offset not in used and len(used) < offsets:
-                used.add(offset)
+            if (
+                np.isfinite(scores[field, frame])
+                and offset not in used_offsets
+                and len(used_offsets) < offsets
+            ):
+                used_offsets.add(offset)
                 rows.append((star, field, frame, Knowledge.FIELD))
     # The bank's star of each start: its middle after the symmetry, and its coefficients, which the
     # symmetry leaves unchanged.
     star, field, frame, knowledge = np.array(rows).T
     match = best_star[star, field, frame]
-    z = posteriors.model.standardised(bank.seidel[match])
-    return Modes.at(star, field, middle[match, frame], knowledge, z)
+    z = posteriors.model.standardise(bank.seidel[match])
+    return Modes.make_starts(star, field, middle[match, frame], knowledge, z)
 
 
 def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
     """Follow matches to the modes of the posterior by damped Gauss–Newton steps.
 
-    A match is given up when even twice the gain that the next step promises leaves it far
-    below the best one; of those that meet, one is kept. The evidence of a mode is the mass of the
-    Gaussian with its height and curvature, up to a constant: ln height + ½ ln det(covariance).
+    A climb is stopped when even twice the gain that the next step promises leaves it far below the
+    best one; of climbs that end at the same mode, one is kept. The evidence of a mode is the mass
+    of the Gaussian with its height and curvature, ln height + ½ ln det(covariance) + constant.
 
     Parameters
     ----------
     modes : Modes
         Starts of the climbs.
     posteriors : StarPosteriors
+        Photon counts and likelihood of the stars, and the model of their stamps.
     """
-    # At the mode, the covariance of z is the inverse of information + 1 (that of the prior). With
+    # At the mode, the covariance of z is the inverse of information + 1, with 1 for the prior. With
     # its Cholesky factor L, ½ ln det(covariance) = Σ ln L_kk.
     peaks = _climb_along(modes, posteriors, np.empty((0, len(MONOMIALS))))
     factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
@@ -177,8 +189,8 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
 def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
     """Refine modes with a free stamp offset, rounded to whole pixels.
 
-    A stamp that is a pixel beside its place leads to another mode, mostly a wrong one, from which
-    steps of whole pixels do not lead back.
+    A stamp that is off by a pixel leads to another mode, mostly a wrong one, from which steps of
+    whole pixels do not lead back.
     """
     # Prior of the shift along rows and columns: normal, with this standard deviation.
     shift_sd_px = 1.5
@@ -188,7 +200,7 @@ def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
     parameters = _climb_along(modes, posteriors, tilts).parameters
     z, shifts = np.split(parameters, [modes.z.shape[1]], axis=1)
     offset = modes.offset - np.rint(shift_sd_px * shifts).astype(int)
-    return Modes.at(modes.star, modes.field, offset, modes.knowledge, z)
+    return Modes.make_starts(modes.star, modes.field, offset, modes.knowledge, z)
 
 
 def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.ndarray) -> Peaks:
@@ -199,13 +211,14 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
     modes : Modes
         Starts of the climbs.
     posteriors : StarPosteriors
+        Photon counts and likelihood of the stars, and the model of their stamps.
     added_directions : ndarray, shape (K, 8)
-        Directions of the monomials' coefficients, with a standard normal prior, as z has.
+        Directions of the monomials' coefficients, with a standard normal prior like z.
     """
     likelihood, model = posteriors.likelihood, posteriors.model
 
     def evaluate(rows: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        # Stamps and their slopes by z and along the added directions.
+        # Stamps and their derivatives by z and along the added directions.
         field, terms = modes.field[rows], modes.z.shape[1]
         coefficients = model.coefficients(z[:, :terms], field) + z[:, terms:] @ added_directions
         directions = np.concatenate(
@@ -214,9 +227,9 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
         stamps, slopes = model.derivatives(coefficients, directions, modes.offset[rows])
         # Poisson likelihood times the prior N(0, 1): their logarithms and derivatives add up.
         # ln posterior = −½ (deviance + |z|²), slope = score − z, information + 1.
-        counts, expected = posteriors.counts[modes.star[rows]], likelihood.expected(stamps)
+        counts, mean_counts = posteriors.counts[modes.star[rows]], likelihood.predict_counts(stamps)
         deviance, score, information = poisson_information(
-            counts, expected, likelihood.flux * slopes
+            counts, mean_counts, likelihood.flux * slopes
         )
         height = -0.5 * (deviance + (z**2).sum(axis=1))
         return height, score - z, information + np.eye(z.shape[1])
@@ -226,7 +239,7 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
     return climb_posterior(evaluate, start, model.max_abs_z, steps, modes.group)
 
 
-def unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> np.ndarray:
+def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> np.ndarray:
     """List the stars whose best mode does not explain their image, without or with their field.
 
     For the right mode and P pixels, χ² = Σ (n − μ)²/μ has the mean P and the variance 2P. A star is
@@ -237,7 +250,9 @@ def unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -
     modes : Modes
         Results of `climb`.
     posteriors : StarPosteriors
+        Photon counts and likelihood of the stars, and the model of their stamps.
     misfit_sigma : float
+        Allowed excess of χ² in standard deviations.
 
     Returns
     -------
@@ -247,17 +262,18 @@ def unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -
     modes = modes.best_of_group
     stamps = posteriors.model.stamps(modes.z, modes.field, modes.offset).astype(np.float64)
     # χ² of the photons about the counts that the mode predicts.
-    expected = posteriors.likelihood.expected(stamps.reshape(len(stamps), -1))
-    chi2 = ((posteriors.counts[modes.star] - expected) ** 2 / expected).sum(axis=1)
-    pixels = expected.shape[1]
+    mean_counts = posteriors.likelihood.predict_counts(stamps.reshape(len(stamps), -1))
+    chi2 = ((posteriors.counts[modes.star] - mean_counts) ** 2 / mean_counts).sum(axis=1)
+    pixels = mean_counts.shape[1]
     return np.unique(modes.star[chi2 > pixels + misfit_sigma * np.sqrt(2.0 * pixels)])
 
 
-def corners(modes: Modes, stars: np.ndarray) -> Modes:
+def place_corners(modes: Modes, stars: np.ndarray) -> Modes:
     """Place starts all around the best modes of the stars with these numbers.
 
-    They serve stars whose climbs have ended in local maxima: a climb from beside one mostly ends
-    elsewhere. Starts are the 2⁵ corners of a cube around the mode, 0.5 away in every coefficient.
+    They are for stars whose climbs have ended in local maxima: a climb that starts next to such a
+    maximum mostly ends elsewhere. Starts are the 2⁵ corners of a cube around the mode, 0.5 away
+    in every coefficient.
     """
     modes = modes.best_of_group
     stuck = np.flatnonzero(np.isin(modes.star, stars))
@@ -265,7 +281,7 @@ def corners(modes: Modes, stars: np.ndarray) -> Modes:
     signs = np.array(list(product((-1.0, 1.0), repeat=modes.z.shape[1])))
     start = modes.take(np.repeat(stuck, len(signs)))
     z = start.z + 0.5 * np.tile(signs, (stuck.size, 1))
-    return Modes.at(start.star, start.field, start.offset, start.knowledge, z)
+    return Modes.make_starts(start.star, start.field, start.offset, start.knowledge, z)
 
 
 def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
@@ -281,25 +297,25 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
     Parameters
     ----------
     modes : Modes
-        Results of `climb`; those found without the field are used.
+        Results of `climb`; modes found without knowledge of the field are used.
     posteriors : StarPosteriors
         Their stamps and likelihood; the images are not used.
 
     Returns
     -------
     Modes
-        Starts for `climb`, at most 40 of a star.
+        Starts for `climb`, at most 40 per star.
     """
     likelihood, model = posteriors.likelihood, posteriors.model
     # The three best modes of every star, their monomial coefficients m, and the Fisher
     # information F² ∂p ∂pᵀ / (F p + B) of the eight.
     blind = modes.take(np.flatnonzero(modes.knowledge == Knowledge.NONE))
-    source = blind.take(largest_of_groups(blind.star, blind.evidence, 3))
+    source = blind.take(select_largest(blind.star, blind.evidence, 3))
     coefficients = model.coefficients(source.z, source.field)
     axes = np.tile(np.eye(len(MONOMIALS)), (len(coefficients), 1, 1))
     stamps, jacobian = model.derivatives(coefficients, axes, source.offset)
     light = likelihood.flux * jacobian
-    metric = (light / likelihood.expected(stamps)[:, None]) @ light.swapaxes(1, 2)
+    metric = (light / likelihood.predict_counts(stamps)[:, None]) @ light.swapaxes(1, 2)
     # Log-likelihood at the mode: its evidence without the width of the Gaussian and the prior.
     width = np.log(np.diagonal(source.factor, axis1=1, axis2=2)).sum(axis=1)
     height = source.evidence - width + 0.5 * (source.z**2).sum(axis=1)
@@ -307,12 +323,12 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
     fields = np.arange(len(model.field))
     static = model.coefficients(np.zeros((fields.size, source.z.shape[1])), fields)
     directions = model.directions(fields)
-    shifts = np.array(jitters(1))
+    shifts = np.array(list_jitters(1))
     tilt = model.tilt_coefficients(shifts)
     # Signs that negate the even part of a wavefront, which leaves its image unchanged.
     even_signs = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
     # Best log-mass and z by star, field and offset.
-    places: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
+    candidates: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
     # From each mode, and from its twin with the even part negated, to all fields and offsets.
     for m, star in enumerate(source.star):
         for sign in (np.ones(len(MONOMIALS)), even_signs):
@@ -324,18 +340,18 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
             possible = log_mass > log_mass.max() - modes.max_drop
             for f, k in zip(*np.nonzero(possible), strict=True):
                 key = (star, f, *(source.offset[m] + shifts[k]))
-                if key not in places or log_mass[f, k] > places[key][0]:
-                    places[key] = (log_mass[f, k], z[f, k])
+                if key not in candidates or log_mass[f, k] > candidates[key][0]:
+                    candidates[key] = (log_mass[f, k], z[f, k])
     # Star, field and offset of every candidate, with its log-mass and z.
-    keys = np.array(list(places))
-    log_mass, z = (np.array(column) for column in zip(*places.values(), strict=True))
-    # The best offset of every field, then the best fields: no field crowds out another.
+    keys = np.array(list(candidates))
+    log_mass, z = (np.array(column) for column in zip(*candidates.values(), strict=True))
+    # The best offset of every field, then the best fields, so that many fields are represented.
     star_and_field = keys[:, 0] * fields.size + keys[:, 1]
-    twins = largest_of_groups(star_and_field, log_mass, 1)
-    twins = twins[largest_of_groups(keys[twins, 0], log_mass[twins], 40)]
+    twins = select_largest(star_and_field, log_mass, 1)
+    twins = twins[select_largest(keys[twins, 0], log_mass[twins], 40)]
     keys = keys[twins]
     knowledge = np.full(twins.size, Knowledge.NONE)
-    return Modes.at(keys[:, 0], keys[:, 1], keys[:, 2:], knowledge, z[twins])
+    return Modes.make_starts(keys[:, 0], keys[:, 1], keys[:, 2:], knowledge, z[twins])
 
 
 def _best_coefficients(
@@ -357,12 +373,12 @@ def _best_coefficients(
     log_mass : ndarray, shape (F, V)
         Logarithm of the Gaussian's integral over z, up to a constant.
     z : ndarray, shape (F, V, 5)
-        Place of the maximum.
+        Position of the maximum.
     """
     # Normal equations (D M Dᵀ + 1) z = D M gap.
-    weighted = directions @ metric
-    curvature = weighted @ directions.swapaxes(1, 2) + np.eye(directions.shape[1])
-    z = np.linalg.solve(curvature, weighted @ gap.swapaxes(1, 2)).swapaxes(1, 2)
+    weighted_directions = directions @ metric
+    curvature = weighted_directions @ directions.swapaxes(1, 2) + np.eye(directions.shape[1])
+    z = np.linalg.solve(curvature, weighted_directions @ gap.swapaxes(1, 2)).swapaxes(1, 2)
     # Integral of the Gaussian: its height at the maximum times det(curvature)^−½.
     residual = gap - z @ directions
     loss = ((residual @ metric) * residual).sum(axis=2) + (z**2).sum(axis=2)

@@ -44,7 +44,7 @@ class Bank:
         Stars per matrix product, which does not change results; scores of 420 test stars then fit
         the cache.
     mirror_margin : int
-        Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`).
+        Pixels in addition to the jitter that a flipped stamp needs (`Symmetry.window`).
     """
 
     framed: np.ndarray
@@ -57,10 +57,10 @@ class Bank:
     mirror_margin: ClassVar[int] = 1
 
     @classmethod
-    def of(cls, columns: Mapping[str, np.ndarray], points: int, jitter_px: int) -> Self:
-        """Make a bank from the columns of `estimates.fresh_stars`."""
-        framed, field, peak = (columns[name] for name in ("framed", "field_index", "peak"))
-        return cls(framed, field, peak, columns["seidel"], points, jitter_px)
+    def from_columns(cls, columns: Mapping[str, np.ndarray], points: int, jitter_px: int) -> Self:
+        """Make a bank from the columns of `estimates.simulate_fresh_stars`."""
+        frames, field, peak = (columns[name] for name in ("framed", "field_index", "peak"))
+        return cls(frames, field, peak, columns["seidel"], points, jitter_px)
 
     def __len__(self) -> int:
         return len(self.framed)
@@ -81,16 +81,16 @@ class Bank:
         # The margin stands on either side of a stamp.
         side = self.framed.shape[-1] - 2 * self.margin
         # A slice: the same window in all stars needs no list of pixels for each.
-        cut = self.framed[:, row : row + side, column : column + side]
-        return normalise_flux(cut.astype(np.float64))[0]
+        stamps = self.framed[:, row : row + side, column : column + side]
+        return normalise_flux(stamps.astype(np.float64))[0]
 
 
-def symmetry_weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
+def compute_symmetry_weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
     """Count how often each symmetry of each star is used, so that all fields stay equally likely.
 
     At a field point on a mirror axis two symmetries (in the centre all eight) lead
-    to the same star, with its equal maxima exchanged. Only the one that frames the
-    first maximum in (row, column) order is right; it counts for all of them.
+    to the same star, with its equal maxima exchanged. Only the symmetry that frames the
+    first maximum in (row, column) order is right; it has the weight of all of them.
 
     Parameters
     ----------
@@ -118,18 +118,18 @@ def symmetry_weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.nda
     return np.where(order == first, is_same_field.sum(axis=2), 0)
 
 
-def jitters(jitter_px: int) -> list[tuple[int, int]]:
+def list_jitters(jitter_px: int) -> list[tuple[int, int]]:
     """List all centring errors (row, column) of up to `jitter_px` pixels per axis."""
     shifts = range(-jitter_px, jitter_px + 1)
     return list(product(shifts, shifts))
 
 
-def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
+def cut_templates(frames: np.ndarray, jitter_px: int) -> np.ndarray:
     """Cut static PSFs at all centring errors, as the stage `stars` cuts them.
 
     Parameters
     ----------
-    framed : ndarray, shape (F, d + 2·jitter_px, d + 2·jitter_px)
+    frames : ndarray, shape (F, d + 2·jitter_px, d + 2·jitter_px)
         Array `psf` of the product "templates".
     jitter_px : int
         Largest centring error in pixels per axis.
@@ -137,11 +137,13 @@ def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
     Returns
     -------
     ndarray, shape (F, J, d, d), float32
-        Sum 1; order of `jitters`.
+        Sum 1; order of `list_jitters`.
     """
-    framed = framed.astype(np.float64)
-    cuts = [crop_jittered(framed, np.array(jitter), jitter_px) for jitter in jitters(jitter_px)]
-    return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1).astype(np.float32)
+    frames = frames.astype(np.float64)
+    cuts = [
+        crop_jittered(frames, np.array(jitter), jitter_px) for jitter in list_jitters(jitter_px)
+    ]
+    return np.stack([normalise_flux(stamps)[0] for stamps in cuts], axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ class Likelihood:
     mean_image: np.ndarray
 
     @classmethod
-    def of(cls, noise: NoiseModel, level: float, images: np.ndarray) -> Likelihood:
+    def from_noise(cls, noise: NoiseModel, level: float, images: np.ndarray) -> Likelihood:
         """Make the likelihood at noise level λ, around the mean of images of shape (n, d, d)."""
         # The mean over its eight mirror images does not change under any symmetry.
         mean = images.mean(axis=0, dtype=np.float64)
@@ -182,7 +184,7 @@ class Likelihood:
         signal = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
         return signal + self.background
 
-    def expected(self, stamps: np.ndarray) -> np.ndarray:
+    def predict_counts(self, stamps: np.ndarray) -> np.ndarray:
         """Return the mean counts F p + B of noise-free stamps."""
         return np.asarray(self.flux * stamps + self.background)
 
@@ -203,7 +205,7 @@ class Likelihood:
         # product in single precision.
         scale = self.flux / self.background
         ratio = np.log1p(scale * stamps)
-        offset = ratio @ self.expected(self.mean_image) - self.flux * stamps.sum(axis=1)
+        offset = ratio @ self.predict_counts(self.mean_image) - self.flux * stamps.sum(axis=1)
         ratio -= np.log1p(scale * self.mean_image)
         return ratio, offset
 
@@ -217,7 +219,7 @@ class ScoredStars:
     star, field : ndarray of int, shape (K,)
         Their numbers in the bank and their fields after `symmetry`; equal fields are adjacent.
     symmetry, jitter : int
-        Numbers in `SYMMETRIES` and `jitters`.
+        Numbers in `SYMMETRIES` and `list_jitters`.
     images : ndarray, shape (K, P), float32
         Noise-free images before `symmetry`.
     scores : ndarray, shape (n, K), float64
@@ -276,7 +278,7 @@ class PosteriorSums:
         for name, values in vars(replacement).items():
             getattr(self, name)[stars] = values
 
-    def rescaled(self, log_scale: np.ndarray) -> PosteriorSums:
+    def rescale(self, log_scale: np.ndarray) -> PosteriorSums:
         """Return the same sums with weights relative to exp(`log_scale`), shape (n,)."""
         # A star without any possible image has scale 0 and keeps sums of zero.
         # Σw changes by the ratio of the scales, Σw² by its square.
@@ -308,7 +310,7 @@ class PosteriorSums:
         """Posterior variance of every pixel of the noise-free image, (n, P); NaN as above."""
         with np.errstate(invalid="ignore"):
             mean_square = self.image_square_sum / self.weight_sum[:, None]
-            # Rounding must not make it negative.
+            # Rounding must not lead to a negative variance.
             return np.asarray(np.maximum(mean_square - self.mean_image**2, 0.0))
 
     def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -317,43 +319,48 @@ class PosteriorSums:
         Parameters
         ----------
         templates : ndarray, shape (F, J, d, d)
+            Static PSF of every field at every centring error.
         """
-        # Posterior probability of every static PSF; their mixture has mean and variance.
+        # Mean and variance of the mixture of static PSFs with their posterior probabilities.
         weight = self.template_weight.reshape(len(self.template_weight), -1)
         with np.errstate(invalid="ignore"):
             weight = weight / self.weight_sum[:, None]
-        return mixture_moments(weight, templates.reshape(weight.shape[1], -1).astype(np.float64))
+        return compute_mixture_moments(
+            weight, templates.reshape(weight.shape[1], -1).astype(np.float64)
+        )
 
     def add(self, part: ScoredStars) -> None:
         """Add images of one symmetry and jitter."""
         log_scale = np.maximum(self.log_scale, part.scores.max(axis=1))
         # Images with a log-weight more than 30 below a star's best are left out: millions of them
         # together weigh less than 1e-6 of the best one.
-        used = np.flatnonzero((part.scores > (log_scale - 30.0)[:, None]).any(axis=0))
-        if not used.size:
+        columns = np.flatnonzero((part.scores > (log_scale - 30.0)[:, None]).any(axis=0))
+        if not columns.size:
             return
-        # Sums of stars that have a new best image go over to its scale.
-        changed = np.flatnonzero(log_scale != self.log_scale)
-        self.put(changed, self.take(changed).rescaled(log_scale[changed]))
-        # A star of which no image is possible so far keeps weights of zero.
-        log_weight = part.scores[:, used] - np.maximum(log_scale, np.finfo(float).min)[:, None]
+        # The sums of stars with a new best image are rescaled to it.
+        star_numbers = np.flatnonzero(log_scale != self.log_scale)
+        self.put(star_numbers, self.take(star_numbers).rescale(log_scale[star_numbers]))
+        # A star without any possible image so far keeps weights of zero.
+        log_weight = part.scores[:, columns] - np.maximum(log_scale, np.finfo(float).min)[:, None]
         weight = np.exp(log_weight.astype(np.float32))
         self.weight_sum += weight.sum(axis=1, dtype=np.float64)
         self.weight_square_sum += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
         # The symmetry moves the sum over images, instead of every image.
-        images, symmetry = part.images[used], SYMMETRIES[part.symmetry]
+        images, symmetry = part.images[columns], SYMMETRIES[part.symmetry]
         side = int(np.sqrt(images.shape[1]))
         for image_sum, values in ((self.image_sum, images), (self.image_square_sum, images**2)):
             moved_sum = symmetry.image((weight @ values).reshape(-1, side, side))
             np.add(image_sum, moved_sum.reshape(image_sum.shape), out=image_sum)
         # Images of the same field are adjacent: one sum for each run.
-        field = part.field[used]
+        field = part.field[columns]
         start = np.flatnonzero(np.diff(field, prepend=-1))
         by_field = np.add.reduceat(weight, start, axis=1)
         self.template_weight[:, field[start], part.jitter] += by_field
 
 
-def mixture_moments(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_mixture_moments(
+    weight: np.ndarray, images: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and variance, (n, P) both, of images (K, P) with weights (n, K) of sum 1."""
     # E[p] and E[p²] − E[p]²; rounding must not make the variance negative.
     mean = weight @ images
@@ -362,35 +369,35 @@ def mixture_moments(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray,
 
 def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
     """Return the sums over several sets of samples of the same stars; the parts stay unchanged."""
-    # All sums at the largest scale of every star, then added.
+    # All sums are rescaled to the maximum of every star, then added.
     log_scale = np.max([part.log_scale for part in parts], axis=0)
-    total = parts[0].rescaled(log_scale)
+    total = parts[0].rescale(log_scale)
     for part in parts[1:]:
-        for name, values in vars(part.rescaled(log_scale)).items():
+        for name, values in vars(part.rescale(log_scale)).items():
             if name != "log_scale":
                 setattr(total, name, getattr(total, name) + values)
     return total
 
 
 def score_bank(bank: Bank, noisy: np.ndarray, likelihood: Likelihood) -> Iterator[ScoredStars]:
-    """Weigh all stars of a bank at all jitters and symmetries; parameters as `posterior_sums`."""
+    """Weight all stars of a bank at all jitters and symmetries; parameters as `sum_posterior`."""
     residuals = likelihood.residuals(noisy).reshape(noisy.shape)
     # Instead of mirroring every image of the bank, the test stars are mirrored back.
-    mirrored = [
+    mirrored_residuals = [
         symmetry.undo(residuals).reshape(len(noisy), -1).astype(np.float32)
         for symmetry in SYMMETRIES
     ]
     # Symmetries and jitters that need the same pixels of a framed star share its stamp.
     by_window = defaultdict(list)
     for s, symmetry in enumerate(SYMMETRIES):
-        for j, jitter in enumerate(jitters(bank.jitter_px)):
+        for j, jitter in enumerate(list_jitters(bank.jitter_px)):
             by_window[symmetry.window(jitter, bank.margin)].append((s, j))
     order = np.argsort(bank.field, kind="stable")  # stars of a field are adjacent
     for start in steps("bank", range(0, order.size, bank.chunk)):
         stars = order[start : start + bank.chunk]
         part = bank.take(stars)
-        with np.errstate(divide="ignore"):  # −∞ where a symmetry does not count
-            log_prior = np.log(symmetry_weights(part.field, part.peak, part.points))
+        with np.errstate(divide="ignore"):  # −∞ where a symmetry is not used
+            log_prior = np.log(compute_symmetry_weights(part.field, part.peak, part.points))
         for window, members in by_window.items():
             # Factors in double precision, their product with the residuals in single.
             stamps = part.stamps(window).reshape(len(part), -1)
@@ -398,18 +405,18 @@ def score_bank(bank: Bank, noisy: np.ndarray, likelihood: Likelihood) -> Iterato
             images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
             for s, j in members:
                 # ln prior + Σ (n − n̄)(ℓ − ℓ̄) + offset
-                scores = mirrored[s] @ ratio_t + (offset + log_prior[:, s])
+                scores = mirrored_residuals[s] @ ratio_t + (offset + log_prior[:, s])
                 field = SYMMETRIES[s].field(part.field, bank.points)
                 yield ScoredStars(stars, field, s, j, images, scores)
 
 
-def groups_by_field(
+def group_by_field(
     count: int, star_field: np.ndarray | None, bank: Bank
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Group test stars with the stars of a bank that may explain them.
 
     Without fields, all test stars are one group with the whole bank. With fields, only stars of
-    the bank count that a symmetry takes to the field of the test star; fields that are mirror
+    the bank are used that a symmetry moves to the field of the test star; fields that are mirror
     images of each other share a group.
 
     Parameters
@@ -419,6 +426,7 @@ def groups_by_field(
     star_field : ndarray of int, shape (n,), optional
         Field of every test star.
     bank : Bank
+        Simulated stars of all fields.
 
     Returns
     -------
@@ -435,23 +443,24 @@ def groups_by_field(
     ]
 
 
-def posterior_sums(
+def sum_posterior(
     bank: Bank, noisy: np.ndarray, likelihood: Likelihood, star_field: np.ndarray | None = None
 ) -> PosteriorSums:
-    """Sum over all stars of a bank, at all jitters and symmetries, weighed by noisy images.
+    """Sum over all stars of a bank, at all jitters and symmetries, weighted by noisy images.
 
     Parameters
     ----------
     bank : Bank
+        M simulated stars, samples of the prior.
     noisy : ndarray, shape (n, d, d)
         Noisy images of one noise level.
     likelihood : Likelihood
         Likelihood at that noise level.
     star_field : ndarray of int, shape (n,), optional
-        Field of every noisy image: only stars that a symmetry takes there count. Each star
-        of the bank must have one that does.
+        Field of every noisy image: only stars that a symmetry moves there are used. Each star
+        of the bank must have such a symmetry.
     """
-    shifts = len(jitters(bank.jitter_px))
+    shifts = len(list_jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
     for part in score_bank(bank, noisy, likelihood):
         # Images in other fields are impossible if the field is known.
@@ -461,7 +470,7 @@ def posterior_sums(
     return sums
 
 
-def exact_posterior(
+def compute_exact_posterior(
     noisy: np.ndarray,
     templates: np.ndarray,
     likelihood: Likelihood,
@@ -480,14 +489,16 @@ def exact_posterior(
     likelihood : Likelihood
         Likelihood at that noise level.
     star_field : ndarray of int, shape (n,), optional
-        Field of every noisy image: only its template counts.
+        Field of every noisy image: only the template of this field is possible.
 
     Returns
     -------
     mean : ndarray, shape (n, d, d)
+        Posterior mean of the image.
     variance : ndarray, shape (n,)
         Posterior variance, mean of the pixels.
     probability : ndarray, shape (n, F)
+        Posterior probability of every template.
     """
     fields, shifts = templates.shape[:2]
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
@@ -497,22 +508,22 @@ def exact_posterior(
     # Templates of other fields are impossible if the field is known.
     if star_field is not None:
         scores[star_field[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
-    # Bayes' rule with a flat prior; the largest score is subtracted against overflow.
+    # Bayes' rule with a flat prior; the maximum score is subtracted against overflow.
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
-    # Moments of the mixture; a template's probability is that of all its centring errors.
-    mean, variance = mixture_moments(weight, images)
+    # Moments of the mixture; a template's probability is summed over all its centring errors.
+    mean, variance = compute_mixture_moments(weight, images)
     probability = weight.reshape(-1, fields, shifts).sum(axis=2)
     return mean.reshape(noisy.shape), variance.mean(axis=1), probability
 
 
-def nested_means(
+def average_nested(
     parts: Sequence[PosteriorSums], measure: Callable[[PosteriorSums], np.ndarray]
 ) -> dict[int, np.ndarray]:
     """Measure a quantity of every star for banks of one, two, four … parts.
 
-    Several disjoint banks of k parts can be made from the same parts; the mean over
-    them is taken, which steadies the small sizes.
+    Several disjoint banks of k parts can be formed from the same parts. The mean over them
+    reduces the scatter of the small sizes.
 
     Parameters
     ----------
@@ -555,7 +566,7 @@ def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, fl
     """
     from scipy.optimize import least_squares
 
-    if len(draws) < 4:  # three parameters need one size more, or the residual says nothing
+    if len(draws) < 4:  # a fit of three parameters needs four sizes for a residual
         return (float("nan"),) * 3
     # Sizes in units of the largest, errors in units of the smallest: all parameters are near 1.
     size = np.asarray(draws, float) / draws[-1]
@@ -566,7 +577,7 @@ def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, fl
         limit, excess, exponent = parameters
         return np.asarray((limit + excess * size**-exponent) / ratio - 1.0)
 
-    # Least squares of relative residuals: small errors of large banks count as much as large ones.
+    # Least squares of relative residuals: small errors of large banks weigh as much as large ones.
     start = (0.9, max(ratio[-1] - 0.9, 1e-3), 0.7)
     fit = least_squares(misfit, start, bounds=((0.0, 0.0, 0.05), (1.0, np.inf, 3.0)), xtol=1e-12)
     return scale * fit.x[0], float(fit.x[2]), float(np.sqrt(np.mean(fit.fun**2)))

@@ -1,11 +1,11 @@
 """Importance sampling of a star's posterior, where the bank has too few stars that resemble it.
 
-In go the modes of stars' posteriors; out come sums over weighted draws, for the posterior mean of
-each star. Coefficients are drawn around all modes, from a mixture of Student's t. The mixture
-is adapted to its own draws (`psfdae_paper.bounds.mixture`), and the
-draws of all rounds are weighed by prior × likelihood over the density of all rounds
+The input is the modes of the stars' posteriors, the output sums over weighted draws, from which the
+posterior mean of each star is computed. Coefficients are drawn around all modes, from a mixture of
+Student's t distributions. The mixture is adapted to its own draws (`psfdae_paper.bounds.mixture`),
+and the draws of all rounds are weighted by prior × likelihood over the density of all rounds
 together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
-brightest pixel the simulator would not frame at o have no weight.
+brightest pixel the simulator would not frame at o get weight 0.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae_paper.bounds.modes import Knowledge, Modes, Place
+from psfdae_paper.bounds.modes import Knowledge, Modes, Positions
 from psfdae_paper.bounds.posterior import PosteriorSums
 from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
 
 
 class Draws(NamedTuple):
-    """Draws of one star, n in all, with what the optics make of them.
+    """The n draws of one star, with their propagated stamps.
 
     Attributes
     ----------
     field, offset, z : ndarray, shapes (n,), (n, 2) and (n, 5)
-        Their `Place`.
+        Field, offset and coefficients, as in `Positions`.
     image : ndarray, shape (n, P), float32
         Stamp of every draw.
     jitter : ndarray of int, shape (n,)
-        Centring error, as number in `jitters`.
+        Centring error, as number in `list_jitters`.
     log_posterior : ndarray, shape (n,)
         Logarithm of prior × likelihood; −∞ for impossible draws.
     """
@@ -49,11 +49,11 @@ class SampledPosterior(NamedTuple):
     Attributes
     ----------
     parts : list of PosteriorSums
-        Sums in four equal parts, whose errors tell whether the draws are enough.
+        Sums in four equal parts, whose errors show whether there are enough draws.
     with_truth : PosteriorSums
-        Sums in one part, with all modes that more knowledge leads to, those climbed from the truth
-        among them. The truth is one draw from the posterior, so the difference shows what the
-        search does not detect of the posterior.
+        Sums in one part over all modes, including modes that are reached only from the truth. The
+        truth is one draw from the posterior, so the difference shows which part of the posterior
+        the search misses.
     """
 
     parts: list[PosteriorSums]
@@ -68,22 +68,24 @@ def sample_posterior(
     rngs: Sequence[np.random.Generator],
     stars_at_once: int = 60,
 ) -> tuple[SampledPosterior, SampledPosterior]:
-    """Draw around modes, weigh the samples and adapt the mixture, in three rounds.
+    """Draw around the modes, weight the samples and adapt the mixture, in three rounds.
 
-    Stars with a mode that only the truth leads to are sampled again with it.
+    Stars with a mode that is reached only from the truth are sampled again with this mode.
 
     Parameters
     ----------
     modes : Modes
-        At least one for every star, and one in its own field.
+        At least one mode for every star, and one in its own field.
     posteriors : StarPosteriors
+        Photon counts and likelihood of the n stars, and the model of their stamps.
     star_field : ndarray of int, shape (n,)
         True field of every star; −1 if it is unknown.
     draws : int
-        Samples a star in all rounds; every mode has one at least in each round.
+        Samples per star in all rounds; every mode gets at least one in each round.
     rngs : sequence of n Generators
+        Random generator of each star.
     stars_at_once : int
-        Stars whose draws are propagated together, to bound the memory.
+        Number of stars whose draws are propagated together, to limit the memory.
 
     Returns
     -------
@@ -111,16 +113,16 @@ def sample_posterior(
             _run_round(samplers, count, posteriors)
         return samplers
 
-    # First around the modes that a search finds. Stars with a mode that only the truth leads to
-    # are sampled again with all modes; the random numbers go on where they were.
-    detected = modes.take(np.flatnonzero(modes.knowledge != Knowledge.TRUTH))
-    undetected = np.unique(modes.star[modes.knowledge == Knowledge.TRUTH])
+    # First around the modes that the search finds. Stars with a mode that is reached only from the
+    # truth are sampled again with all modes; their generators continue.
+    detected_modes = modes.take(np.flatnonzero(modes.knowledge != Knowledge.TRUTH))
+    incomplete_stars = np.unique(modes.star[modes.knowledge == Knowledge.TRUTH])
     rows: list[tuple[PosteriorSums, ...]] = []
     for stars in np.array_split(np.arange(len(rngs)), -(-len(rngs) // stars_at_once)):
-        # These stars, then those among them of which the search has missed a mode.
-        samplers = sample(stars, detected)
-        resampled = stars[np.isin(stars, undetected)]
-        with_truth = dict(zip(resampled, sample(resampled, modes), strict=True))
+        # These stars, then again the stars for which the search has missed a mode.
+        samplers = sample(stars, detected_modes)
+        resampled_stars = stars[np.isin(stars, incomplete_stars)]
+        with_truth = dict(zip(resampled_stars, sample(resampled_stars, modes), strict=True))
         # A row for each star: its parts without and with the field, then both totals.
         for star, sampler in zip(stars, samplers, strict=True):
             totals = with_truth.get(star, sampler).totals(posteriors.model)
@@ -134,15 +136,15 @@ def sample_posterior(
 
 def _run_round(samplers: list[_Sampler], count: int, posteriors: StarPosteriors) -> None:
     """Draw once for several stars; their stamps are propagated together."""
-    places = [sampler.propose(count) for sampler in samplers]
-    field, offset, z = (np.concatenate(column) for column in zip(*places, strict=True))
-    # Draws beyond the limit have no weight; they are propagated at the limit.
+    proposals = [sampler.propose(count) for sampler in samplers]
+    field, offset, z = (np.concatenate(column) for column in zip(*proposals, strict=True))
+    # Draws outside the limit get weight 0; they are propagated at the limit.
     limit = posteriors.model.max_abs_z
     stamps = posteriors.model.stamps(np.clip(z, -limit, limit), field, offset)
     stamps = stamps.reshape(len(stamps), -1)
-    ends = np.cumsum([place.field.size for place in places])[:-1]
-    for sampler, place, images in zip(samplers, places, np.split(stamps, ends), strict=True):
-        sampler.weigh(place, images, posteriors)
+    ends = np.cumsum([position.field.size for position in proposals])[:-1]
+    for sampler, position, images in zip(samplers, proposals, np.split(stamps, ends), strict=True):
+        sampler.weigh(position, images, posteriors)
 
 
 class _Sampler:
@@ -155,14 +157,16 @@ class _Sampler:
     star_field : int
         True field of the star; −1 if it is unknown.
     counts : ndarray, shape (P,)
+        Photons in every pixel of the star's stamp, sky included.
     rng : Generator
+        Random generator of the star.
     """
 
     def __init__(
         self, modes: Modes, star_field: int, counts: np.ndarray, rng: np.random.Generator
     ) -> None:
         self.modes, self.star_field, self.counts, self.rng = modes, star_field, counts, rng
-        # A field counts as detected if a mode in it was found without knowledge of the star.
+        # A field is detected if a mode in it was found without knowledge of the star.
         is_blind = modes.knowledge == Knowledge.NONE
         self.field_is_detected = bool((is_blind & (modes.field == star_field)).any())
         self.mixtures: list[tuple[Modes, np.ndarray]] = []
@@ -174,16 +178,16 @@ class _Sampler:
         """Draws of all rounds."""
         return Draws(*(np.concatenate(column) for column in zip(*self.rounds, strict=True)))
 
-    def propose(self, count: int) -> Place:
-        """Draw about `count` places, from the mixture adapted to the draws before."""
+    def propose(self, count: int) -> Positions:
+        """Draw about `count` positions from the mixture, adapted to the earlier draws."""
         if self.rounds:
-            self.modes = self.modes.adapted(Place(*self.draws[:3]), self.log_weight())
+            self.modes = self.modes.adapt(Positions(*self.draws[:3]), self.log_weight())
         # The density of a draw needs the mixture of its round: it is kept with the number of draws.
-        place, number = self.modes.draw(count, self.star_field, self.rng)
+        position, number = self.modes.draw(count, self.star_field, self.rng)
         self.mixtures.append((self.modes, number))
-        return place
+        return position
 
-    def weigh(self, place: Place, images: np.ndarray, posteriors: StarPosteriors) -> None:
+    def weigh(self, position: Positions, images: np.ndarray, posteriors: StarPosteriors) -> None:
         """Add draws with their images (n, P), prior and likelihood."""
         framing, likelihood = posteriors.model.framing, posteriors.likelihood
         # The simulator frames the first of the brightest pixels, equal within `framing.tie`.
@@ -192,15 +196,15 @@ class _Sampler:
         pixel = np.stack(np.divmod((images >= threshold).argmax(axis=1), framing.stamp_px), axis=1)
         jitter = pixel - framing.stamp_px // 2
         possible = (np.abs(jitter) <= framing.jitter_px).all(axis=1)
-        possible &= (np.abs(place.z) <= posteriors.model.max_abs_z).all(axis=1)
+        possible &= (np.abs(position.z) <= posteriors.model.max_abs_z).all(axis=1)
         number = (jitter + framing.jitter_px) @ [2 * framing.jitter_px + 1, 1]
         # ln(prior × likelihood) = Σ n ln(1 + F p/B) − F Σp − |z|²/2, without constants.
         ratio = np.log1p(images * (likelihood.flux / likelihood.background), dtype=np.float64)
         light = likelihood.flux * images.sum(axis=-1, dtype=np.float64)
         log_posterior = (ratio * self.counts).sum(axis=-1) - light
-        log_posterior = log_posterior - 0.5 * (place.z**2).sum(axis=-1)
+        log_posterior = log_posterior - 0.5 * (position.z**2).sum(axis=-1)
         log_posterior = np.where(possible, log_posterior, -np.inf)
-        self.rounds.append(Draws(*place, images, np.where(possible, number, 0), log_posterior))
+        self.rounds.append(Draws(*position, images, np.where(possible, number, 0), log_posterior))
 
     def log_weight(self) -> np.ndarray:
         """Return ln of prior × likelihood over the density of all rounds' mixtures, shape (n,)."""
@@ -219,7 +223,7 @@ class _Sampler:
         in_field = self.draws.field == self.star_field
         # Every fourth draw goes to the same part: all parts have draws of all rounds and modes.
         part = np.arange(in_field.size) % 4
-        # Without the field, modes in the true field count only if the blind search found one there.
+        # Without the field, draws in the true field are used only if the blind search found it.
         blind = ~in_field | self.field_is_detected
         selections = [kind & (part == k) for kind in (blind, in_field) for k in range(4)]
         return self._sums(selections, model)
@@ -236,19 +240,19 @@ class _Sampler:
         parts = []
         for selection in selections:
             sums = PosteriorSums.empty(1, self.counts.size, len(model.field), shifts)
-            used = np.flatnonzero(selection & np.isfinite(log_weight))
-            if used.size:
+            draw_numbers = np.flatnonzero(selection & np.isfinite(log_weight))
+            if draw_numbers.size:
                 # Weights relative to the largest, as in `PosteriorSums`.
-                sums.log_scale[:] = log_weight[used].max()
-                weight = np.exp(log_weight[used] - sums.log_scale)
+                sums.log_scale[:] = log_weight[draw_numbers].max()
+                weight = np.exp(log_weight[draw_numbers] - sums.log_scale)
                 # Σw and Σw² give the effective sample size (Σw)²/Σw².
                 sums.weight_sum[:] = weight.sum()
                 sums.weight_square_sum[:] = (weight**2).sum()
                 # Σw p and Σw p², and the weight of each static PSF, by field and centring error.
-                images = draws.image[used].astype(np.float64)
+                images = draws.image[draw_numbers].astype(np.float64)
                 sums.image_sum[:] = weight @ images
                 sums.image_square_sum[:] = weight @ images**2
-                cell = (draws.field[used], draws.jitter[used])
+                cell = (draws.field[draw_numbers], draws.jitter[draw_numbers])
                 np.add.at(sums.template_weight[0], cell, weight)
             parts.append(sums)
         return parts

@@ -1,7 +1,7 @@
-"""Stamps of stars as functions of their aberrations, and the posterior of these given photons.
+"""Stamps of stars as functions of their aberrations, and the posterior of the aberrations.
 
-In go standardised Seidel coefficients, fields and places of stamps; out come propagated stamps and
-their derivatives by the coefficients. All searches and samples of a star's posterior use them.
+The input is standardised Seidel coefficients, fields and stamp offsets, the output propagated
+stamps and their derivatives by the coefficients. All searches and samples of a posterior use them.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ class StampModel:
         Prior of the coefficients in waves (`psfdae_paper.stars.fields.perturb`).
     field : ndarray, shape (F, 2)
         Relative field vectors.
-    telescope, optics, framing : config groups
+    telescope, optics, framing : Telescope, Optics, Framing
+        Groups of the configuration.
     max_abs_z : float
-        Largest standardised coefficient that has any weight. The prior beyond it is 2e-9; the tails
-        of proposals reach beyond what can be propagated.
+        Maximum of |z|; draws outside it get weight 0. The prior probability outside it is 2e-9; the
+        tails of the proposals reach aberrations that cannot be propagated.
     """
 
     mean: np.ndarray
@@ -47,7 +48,7 @@ class StampModel:
     framing: Framing
     max_abs_z: float = 6.0
 
-    def standardised(self, seidel: np.ndarray) -> np.ndarray:
+    def standardise(self, seidel: np.ndarray) -> np.ndarray:
         """Return z of coefficients in waves, both (n, 5); 0 where they cannot vary."""
         # z = (c − mean) / sd
         varies = self.sd > 0
@@ -80,6 +81,7 @@ class StampModel:
         z : ndarray, shape (n, 5)
             Standardised coefficients.
         field : ndarray of int, shape (n,)
+            Field of every stamp.
         offset : ndarray, shape (n, 2)
             Middle of the stamp (row, column) from the chief ray, in pixels.
 
@@ -100,7 +102,7 @@ class StampModel:
 
             def propagate(draw: np.ndarray) -> None:
                 opd = (coefficients[draw] @ modes).reshape(-1, *images.shape[1:])
-                # Light beyond the stamp is lost: the sum is made 1 again, as for all stamps.
+                # Light outside the stamp is lost: the sum is normalised to 1, as for all stamps.
                 stamps[draw] = normalise_flux(kernel(opd, offset[draw]))[0]
 
             return propagate
@@ -149,7 +151,7 @@ class StampModel:
     @cached_property
     def _operators(self) -> dict[Precision, SampledStamps]:
         """Propagators by precision, on the smallest pupil grid that the sampling guard allows."""
-        # Stamps differ from those of N = 222 by an MSE of 4e-11 on average and 7e-10 at most.
+        # Stamps differ from stamps with N = 222 by an MSE of 4e-11 on average and 7e-10 at most.
         pupil_samples = {126, 158, 190, 222, 254, 318, 398, 478, 574, 690, 830, 1000}
         return {
             precision: SampledStamps(

@@ -1,4 +1,4 @@
-"""Tables of the bounds: rows of every bound, of their growth, and of methods beside them."""
+"""Tables of the bounds: rows of every bound, of their growth, and of methods next to them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from psfdae_paper.bounds.estimates import (
     SPLIT,
     BoundedStars,
     Estimates,
+    build_stamp_model,
     sample_stars,
-    stamp_model,
     weigh_bank,
 )
-from psfdae_paper.bounds.floor import Comparison, local_error
-from psfdae_paper.bounds.posterior import Bank, Likelihood, exact_posterior, extrapolate
+from psfdae_paper.bounds.floor import Comparison, compute_local_error
+from psfdae_paper.bounds.posterior import Bank, Likelihood, compute_exact_posterior, extrapolate
 from psfdae_paper.bounds.tight import Evidence, calibration
 from psfdae_paper.configuration.schema import Config
 
@@ -42,6 +42,7 @@ class Tables:
     dataset : str
         Name in the tables.
     stars : BoundedStars
+        Test stars whose errors the rows describe.
 
     Attributes
     ----------
@@ -89,9 +90,9 @@ class Tables:
             Noise level λ.
         values : dict of ndarray, shape (n,)
             Metrics of every star. Stars without an estimate, whose `mse` is NaN, are named and left
-            out of every mean. Of the posterior variances `variance` the table has the mean.
+            out of every mean. The table contains the mean of the posterior variances `variance`.
         tight : bool
-            True if the bound is near the least possible error.
+            True if the bound is near the minimum possible error.
         source : str
             Samples behind the bound, for the column `found`.
         **columns : float
@@ -100,7 +101,11 @@ class Tables:
         import pandas as pd
 
         # Columns that all metrics share.
-        key: dict[str, object] = {"dataset": self.dataset, "split": SPLIT, "reference": reference}
+        key: dict[str, object] = {
+            "dataset": self.dataset,
+            "split": SPLIT,
+            "reference": reference,
+        }
         key |= {"method": method, "noise_level": level}
         has_estimate = np.isfinite(values["mse"])
         field = self.stars.field[has_estimate]
@@ -144,10 +149,10 @@ class Tables:
     def add_growth(self, method: str, level: float, measures: dict[int, np.ndarray]) -> None:
         """Add rows of the errors of a posterior mean over a bank by number of draws.
 
-        `measures` are those of `weigh_bank`.
+        `measures` is the result of `weigh_bank`.
         """
         # Errors by number of draws, and the power law a + b M^−c that extrapolates them.
-        draws, bank = np.array(list(measures)), Estimates.over_bank(measures)
+        draws, bank = np.array(list(measures)), Estimates.from_bank(measures)
         for number, reference in enumerate(self.stars.truth):
             errors = np.array([values[number].mean() for values in measures.values()])
             evidence = bank.evidence(number, self.stars.field)
@@ -177,9 +182,9 @@ class Tables:
 def add_floor(config: Config, product: Product, tables: Tables) -> None:
     """Add the local error floor of every star, from the slopes of its stamp."""
     # Relative field vectors of the stars, at which the Seidel terms are evaluated.
-    stars, model = tables.stars, stamp_model(config)
+    stars, model = tables.stars, build_stamp_model(config)
     field = model.field[stars.field]
-    # Slopes of the noise-free stamps by the Seidel coefficients, in waves, as they were simulated.
+    # Derivatives of the noise-free stamps, as simulated, by the Seidel coefficients in waves.
     stamps, derivatives = model.derivatives(
         monomial_coefficients(product["seidel"][stars.star], field),
         monomial_coefficients(np.eye(len(model.sd)), field[:, None]),
@@ -187,10 +192,10 @@ def add_floor(config: Config, product: Product, tables: Tables) -> None:
         product["pupil_samples"][stars.star],
         "complex128",
     )
-    # They serve all noise levels.
+    # The derivatives are the same at all noise levels.
     for level in config.noise.levels:
         variance = noise_model(config).variance(stamps, level)
-        error = local_error(derivatives, model.sd, variance)
+        error = compute_local_error(derivatives, model.sd, variance)
         tables.add("realisation", "floor", level, {"mse": error}, tight=False, source="derivatives")
 
 
@@ -202,35 +207,39 @@ def add_means(
     static: np.ndarray,
     tables: Tables,
 ) -> None:
-    """Add posterior means over a bank, their change with its size, and better ones.
+    """Add posterior means over a bank, their change with its size, and improved ones.
 
-    Stars for which a bank has too few similar stars get importance samples around their own modes.
+    Stars for which the bank has too few similar stars get importance samples around their modes.
 
     Parameters
     ----------
     config : Config
+        Settings of the dataset.
     bank : Bank
-        Stars for the posterior mean without the star's field.
+        Simulated stars for the posterior mean without knowledge of the field.
     large_bank : Bank
-        Stars for that with the field known: only those of few fields count, so that more are
-        needed, and weighing them takes little time.
+        Simulated stars for the posterior mean with the field known. Only few fields can explain a
+        star, so that more simulated stars are needed, and weighting them takes little time.
     product : Product
         Product "stars".
     static : ndarray, shape (F, J, d, d)
         Static PSFs at all centring errors.
     tables : Tables
+        Tables of the dataset, to which rows are added.
     """
     stars = tables.stars
     for level in config.noise.levels:
         start = time.monotonic()
-        likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
+        likelihood = Likelihood.from_noise(
+            noise_model(config), level, bank.stamps((bank.margin,) * 2)
+        )
         # Both posterior means over the bank.
         over_bank, is_sparse = {}, np.zeros(stars.star.size, bool)
         for method, field_is_known in POSTERIOR_MEANS.items():
             prior = large_bank if field_is_known else bank
             measures = weigh_bank(prior, field_is_known, static, stars, level, likelihood)
             tables.add_growth(method, level, measures)
-            over_bank[method] = max(measures), Estimates.over_bank(measures)
+            over_bank[method] = max(measures), Estimates.from_bank(measures)
             is_sparse |= over_bank[method][1].ess < ENOUGH_ESS
         # Both over importance samples, for stars of which one is sparse.
         sparse, over_samples = np.flatnonzero(is_sparse), {}
@@ -238,13 +247,13 @@ def add_means(
             subset = stars.take(sparse)
             posteriors = sample_stars(config, bank, product, subset, level, likelihood)
             for method, samples in zip(POSTERIOR_MEANS, posteriors, strict=True):
-                over_samples[method] = Estimates.over_samples(samples, static, subset)
+                over_samples[method] = Estimates.from_samples(samples, static, subset)
         # The better one for every star.
         for method, (draws, estimates) in over_bank.items():
-            improved, replaced = estimates.improved(sparse, over_samples.get(method))
-            source = {0: "bank", stars.star.size: "samples"}.get(replaced, "both")
+            result, replacements = estimates.replace_sparse(sparse, over_samples.get(method))
+            source = {0: "bank", stars.star.size: "samples"}.get(replacements, "both")
             count = config.bounds.star_draws if source == "samples" else draws
-            tables.add_mean(method, level, improved, source, draws=count, sampled=replaced)
+            tables.add_mean(method, level, result, source, draws=count, sampled=replacements)
         seconds = time.monotonic() - start
         print(f"λ = {level:g}: {sparse.size} stars sampled, {seconds:.1f} s", flush=True)
 
@@ -255,20 +264,24 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     Parameters
     ----------
     config : Config
+        Settings of the dataset.
     static : ndarray, shape (F, J, d, d)
-        Static PSFs at all centring errors, all images that stars without aberrations can have.
+        Static PSFs at all centring errors: all images that stars without aberrations can have.
     tables : Tables
+        Tables of the dataset, to which rows are added.
     """
     stars = tables.stars
     for level in config.noise.levels:
-        # The counts are taken about the mean static PSF without centring error.
-        likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
+        # Counts are relative to the mean static PSF without centring error.
+        likelihood = Likelihood.from_noise(
+            noise_model(config), level, static[:, static.shape[1] // 2]
+        )
         for method, field_is_known in POSTERIOR_MEANS.items():
             field = stars.field if field_is_known else None
-            posterior = exact_posterior(stars.noisy[level], static, likelihood, field)
+            posterior = compute_exact_posterior(stars.noisy[level], static, likelihood, field)
             mean, variance, probability = posterior
             error = mse(mean, stars.truth["realisation"])
-            # Less is rounding, or a handful of doubtful stars: only a few images are possible.
+            # Smaller errors are rounding, or a few doubtful stars: only few images are possible.
             if error.mean() < 1e-9:
                 error, variance = np.zeros_like(error), np.zeros_like(error)
             values = {"mse": error, "variance": variance}
@@ -282,16 +295,16 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
 def compare_methods(
     key: Mapping[str, object],
     methods: pd.DataFrame,
-    bounded: pd.DataFrame,
+    bounds: pd.DataFrame,
     tight: Set[tuple[str, str, str, str]],
 ) -> Iterator[dict[str, object]]:
-    """Compare every method with every bound that it has to respect.
+    """Compare every method with every bound that applies to it.
 
     Parameters
     ----------
     key : mapping
         Columns of one dataset, reference and noise level λ.
-    methods, bounded : DataFrame
+    methods, bounds : DataFrame
         Errors of methods, and bounds, by star.
     tight : set of tuples
         Dataset, reference, bound and λ, in six digits, of the bounds that are tight.
@@ -301,10 +314,10 @@ def compare_methods(
     dict
         Row of the table of efficiencies.
     """
-    place = f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}"
-    for bound in bounded["method"].unique():
-        # Values of this bound by star; its summary tells if it is tight.
-        limits, is_floor = bounded[bounded["method"] == bound], bound == "floor"
+    cell = f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}"
+    for bound in bounds["method"].unique():
+        # Values of this bound by star; its summary shows if it is tight.
+        limits, is_floor = bounds[bounds["method"] == bound], bound == "floor"
         level = f"{key['noise_level']:.6g}"
         is_tight = (key["dataset"], key["reference"], bound, level) in tight
         for method in methods["method"].unique():
@@ -317,27 +330,28 @@ def compare_methods(
             ):
                 continue
             # Errors and bounds of the same stars, which must lie in the same fields.
-            paired = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")
-            if len(paired) < len(limits):
-                missing = len(limits) - len(paired)
-                raise ProductError(f"{place}: {method} lacks {missing} of the bounded stars")
-            mismatched = paired[paired["field"] != paired["field_bound"]]
-            if len(mismatched):
-                star, field, bounded_in = mismatched[["star", "field", "field_bound"]].iloc[0]
+            pairs = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")
+            if len(pairs) < len(limits):
+                missing = len(limits) - len(pairs)
+                raise ProductError(f"{cell}: {method} lacks {missing} of the bounded stars")
+            mismatches = pairs[pairs["field"] != pairs["field_bound"]]
+            if len(mismatches):
+                star, field, bound_field = mismatches[["star", "field", "field_bound"]].iloc[0]
                 raise ProductError(
-                    f"{place}: star {star} of {method} lies in field {field}, "
-                    f"but that of the bounds in {bounded_in}"
+                    f"{cell}: star {star} of {method} lies in field {field}, "
+                    f"but in field {bound_field} in the bounds"
                 )
-            # Stars without a posterior mean are left out; more than 1 % of them forbid a verdict.
-            estimated = paired.mse_bound.notna()
+            # Stars without a posterior mean are left out; with more than 1 % of them there is not
+            # enough evidence for a verdict.
+            has_both = pairs.mse_bound.notna()
             if method in POSTERIOR_MEANS:
-                estimated &= paired.mse.notna()
-            is_judged = (is_floor or is_tight) and (~estimated).mean() <= Evidence.max_sparse
-            paired = paired[estimated]
-            comparison = Comparison.paired(
-                paired["mse"].to_numpy(),
-                paired["mse_bound"].to_numpy(),
-                paired["field"].to_numpy(),
+                has_both &= pairs.mse.notna()
+            is_judged = (is_floor or is_tight) and (~has_both).mean() <= Evidence.max_sparse
+            pairs = pairs[has_both]
+            comparison = Comparison.from_pairs(
+                pairs["mse"].to_numpy(),
+                pairs["mse_bound"].to_numpy(),
+                pairs["field"].to_numpy(),
                 # The floor is an approximation that the posterior mean itself may undercut by 15 %.
                 0.2 if is_floor else Comparison.tolerance,
             )
@@ -351,15 +365,15 @@ def compare_methods(
                 "efficiency": comparison.efficiency if is_judged else None,
                 "difference": comparison.difference,
                 "stderr": comparison.stderr,
-                "n": len(paired),
-                "median": paired.mse.median(),
-                "median_bound": paired.mse_bound.median(),
-                "variance_bound": paired.variance.mean(),
+                "n": len(pairs),
+                "median": pairs.mse.median(),
+                "median_bound": pairs.mse_bound.median(),
+                "variance_bound": pairs.variance.mean(),
                 "verdict": ("beaten" if comparison.beaten else "ok") if is_judged else None,
             }
 
 
-def paper_verdict(paper: Comparison, tight: bool) -> str:
+def judge_paper(paper: Comparison, tight: bool) -> str:
     """Return the verdict of a bound, tight or not, on the paper's error, in words."""
     # Only a tight bound can show that an error is smaller than possible.
     if paper.difference >= 0:

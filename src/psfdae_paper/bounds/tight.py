@@ -1,9 +1,9 @@
-"""Evidence by which a posterior mean over samples counts as the exact one.
+"""Evidence that a posterior mean over samples is near the exact one.
 
-The error of the exact posterior mean is the least that any estimator has: a tight bound. That of a
-mean over too few samples, or over samples that miss a mode, is above it, and bounds nothing. In go
-errors and variances of n stars; out comes `Evidence`, whose property `tight` decides whether the
-tables call the error a bound or only an upper limit of it.
+The error of the exact posterior mean is the minimum of all estimators: a tight bound. A mean over
+too few samples, or over samples that miss a mode, has a larger error, which is not a bound. The
+input is errors and variances of n stars, the output `Evidence`. Its property `tight` decides if
+the tables call the error a bound, or only an upper limit of the bound.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Evidence:
     Attributes
     ----------
     ess_low : float
-        Effective sample size that all but `max_sparse` of the stars have at least.
+        Minimum effective sample size, without a fraction `max_sparse` of the stars.
     calibration : float
         Mean squared error minus mean posterior variance in standard errors of this
         difference. For the exact posterior of stars drawn from the prior the two are equal:
@@ -31,7 +31,7 @@ class Evidence:
     last_change : float
         Relative change of the error by the last fourfold growth of the samples.
     undetected : float
-        Part of the error that vanishes if modes are added that only the truth leads to.
+        Part of the error that vanishes if modes are added that are reached only from the truth.
     max_sparse : float
         Largest fraction of the stars that may have fewer samples than needed, or no estimate.
     """
@@ -43,7 +43,7 @@ class Evidence:
     max_sparse: ClassVar[float] = 0.01
 
     @classmethod
-    def of(
+    def from_errors(
         cls,
         mse: np.ndarray,
         variance: np.ndarray,
@@ -52,9 +52,9 @@ class Evidence:
         last_change: float,
         undetected: float,
     ) -> Evidence:
-        """Make evidence from errors, posterior variances, effective sizes and fields of n stars.
+        """Compute the evidence from errors, variances, effective sizes and fields of n stars.
 
-        Stars without an estimate have an `mse` of NaN, and count as stars without samples.
+        Stars without an estimate have an `mse` of NaN, and are treated as stars without samples.
         """
         has_estimate = np.isfinite(mse)
         # Effective size that all but the allowed fraction of stars reach; 0 without an estimate.

@@ -48,7 +48,7 @@ class Alignment(Group):
     """Tilt of the secondary about x and y: ± this."""
     # In focus an astigmatic image is nearly the same for opposite signs of the astigmatism, so a
     # tilt and its opposite, each with a matching decentre, give nearly the same nine stamps; a
-    # known defocus (0.3 waves RMS) tells them apart. The paper only says that the CCD stays in a
+    # known defocus (0.3 waves RMS) separates them. The paper only says that the CCD stays in a
     # fixed position.
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = 2e-4
     """Fixed distance of the CCD beyond best focus."""
@@ -61,11 +61,11 @@ class Alignment(Group):
     """Highest Noll index of the wavefront."""
     model_tolerance_waves: Positive = 5e-4
     """Largest RMS by which the quadratic model may differ from ray tracing."""
-    # Stamps are centred on the centroid and not jittered, so that there is no shift to estimate.
+    # Stamps are centred on the centroid and not jittered, so that no shift has to be estimated.
     stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = 16
     """Side d of a stamp, centred on the image's centroid."""
     least_energy: Annotated[float, Field(gt=0, lt=1)] = 0.9
-    """A stamp with less than this part of the light is refused."""
+    """A stamp with less than this part of the light is rejected."""
     # 5 levels in each of 4 degrees of freedom: the paper's 625 states.
     grid_levels: Annotated[int, Field(ge=2, le=9)] = 5
     """Levels per degree of freedom of the grid of states."""
@@ -89,7 +89,7 @@ class Alignment(Group):
 class Cnn(Group):
     """Convolutions and a linear layer, the paper's network (section 3.3)."""
 
-    # The paper does not state them; with these its training takes less than a minute.
+    # The paper does not give them; with these its training takes less than a minute.
     widths: Annotated[list[Count], Field(min_length=1)] = Field([64, 64, 128, 128, 128])
     """Channels after every convolution."""
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=15)]], Field(min_length=1)] = Field(
@@ -100,7 +100,7 @@ class Cnn(Group):
         [2, 1, 2, 1, 2]
     )
     """Strides of the convolutions."""
-    # A neuron that is never active would not learn otherwise.
+    # A neuron that is never active would not be trained otherwise.
     leak: Annotated[float, Field(ge=0, lt=1)] = 0.01
     """Slope of the leaky ReLU below 0."""
 
@@ -148,7 +148,7 @@ class NetworkTrain(Group):
     The defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋.
     """
 
-    # What is trained, and for how long.
+    # Network and length of the training.
     network: Literal["cnn", "perceptron"] = "cnn"
     """Network that is trained."""
     epochs: Count = 100
@@ -164,11 +164,11 @@ class NetworkTrain(Group):
     """Factor of the learning rate at each step of the schedule."""
     decay_epochs: Count = 30
     """Epochs between steps of the schedule."""
-    # What makes more of the training states.
+    # Augmentation of the training states.
     mirrors: bool = False
     """Train on the telescope's mirror images and average estimates over them."""
     noise_draws: Count = 1
-    """Draws of each field's noise where the DAE's output is learnt, whose computation takes long;
+    """Draws of each field's noise for a training on the DAE's output, whose computation takes long;
     noisy stamps get new noise in every epoch."""
     # These change no result but by rounding.
     threads: Count = 1

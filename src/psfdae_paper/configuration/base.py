@@ -15,15 +15,15 @@ SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)
 """Search distance in λ/D. Products do not contain it, but the distance in pixels that follows."""
 
 
-def search_distance(distance: object = None) -> float:
+def get_search_distance(distance: object = None) -> float:
     """Return the distance around the chief ray within which a brightest pixel is searched, in λ/D.
 
-    It is the given one or, if that is no positive number, the default.
+    It is the given distance or, if this is not a positive number, the default.
     """
     if isinstance(distance, int | float) and not isinstance(distance, bool) and distance > 0:
         return distance
     # Four times the distance of the farthest template of scene 1. A peak that lies farther out is
-    # searched at twice the distance, then refused.
+    # searched at twice the distance, then rejected.
     return 48.0
 
 
@@ -31,7 +31,7 @@ def config_dir() -> Path:
     """Return the folder of the configuration tree.
 
     The environment variable `PSFDAE_CONFIG` names it; otherwise it is the copy that an installed
-    package has, or `config/` of the source tree. ConfigError if it has no `config.yaml`.
+    package has, or `config/` of the source tree. ConfigError if `config.yaml` is not in it.
     """
     return _folder(os.environ.get("PSFDAE_CONFIG", ""))
 
@@ -40,7 +40,7 @@ def config_dir() -> Path:
 def _folder(environment_value: str) -> Path:
     """Return the folder that an environment variable names, or the package's folder.
 
-    A wheel has a copy of the configuration in the package; in the source tree it is beside `src`.
+    A wheel has a copy of the configuration in the package; in the source tree it is next to `src`.
     """
     # The folder psfdae_paper, wherever it is.
     package = Path(__file__).resolve().parents[1]

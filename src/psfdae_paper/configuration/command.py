@@ -1,7 +1,7 @@
 """Commands whose settings are groups of the configuration that Hydra composes.
 
-In goes the name of a command and of the groups that it reads; its function gets them, checked, as
-`config`: from a file that the workflow has written, or from overrides of the command line.
+A command has a name and the groups that it reads. Its function receives them, checked, as `config`:
+from a file that the workflow has written, or from overrides of the command line.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Groups:
     reads : tuple of str, or callable
         Names of the groups, or a function of the command's options that returns them.
     choice : tuple of str
-        Overrides that precede those of the command line, such as the dataset of the command.
+        Overrides that precede the command line's, such as the dataset of the command.
     foreign_options : mapping
-        Options of Hydra's own programs, with what does the same here.
+        Options of Hydra's own programs, with their equivalent here.
     """
 
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
@@ -67,7 +67,7 @@ class Groups:
         file : Path, optional
             File of `compose.write_settings`, which `--config` names.
         words : sequence of str
-            Overrides such as noise.kappa=4.98, if there is no file.
+            Overrides such as noise.kappa=4.98, used if `file` is None.
 
         Raises
         ------
@@ -82,9 +82,9 @@ class Groups:
         reads = self.names(options)
         if file is not None:
             return load_settings(file, reads)
-        return load_stage(reads, self.with_choice(words))
+        return load_stage(reads, self.prepend_choice(words))
 
-    def with_choice(self, words: Sequence[str]) -> tuple[str, ...]:
+    def prepend_choice(self, words: Sequence[str]) -> tuple[str, ...]:
         """Return the command's choice, then overrides; ConfigError if one changes the choice."""
         # A command of scene 3 has its dataset; another one would have other groups.
         for word in words if self.choice else ():
@@ -98,15 +98,15 @@ def command(
 ) -> Callable[[Function], Function]:
     """Make a function the command `name`; its `config` has groups of the configuration.
 
-    See `psfdae.commands.cli.command`, and `Groups` for `reads`. Those of "paper alignment …" are
-    for scene 3 alone, and choose its dataset.
+    See `psfdae.commands.cli.command`, and `Groups` for `reads`. Commands "paper alignment …" are
+    for scene 3 only, and choose its dataset.
 
     Parameters
     ----------
     name : str
         Up to four words, such as "paper alignment figure stamps".
     reads : tuple of str, or callable
-        Groups that the function gets as `config`; none if it has no such parameter.
+        Groups that the function receives as `config`; empty if it lacks this parameter.
     """
     choice = ("dataset=alignment",) if name.startswith("paper alignment ") else ()
     # The command line calls `Groups` with the options, the file and the words that are left.

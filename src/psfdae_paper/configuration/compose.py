@@ -1,13 +1,13 @@
 """Composition and check of settings: Hydra composes files of `config/`, pydantic checks them.
 
-In goes a list of overrides such as `dataset=dataset3 preset=smoke noise.levels=[0.002]`; out comes
-a configuration in three forms, each made from the one before:
+The input is a list of overrides such as `dataset=dataset3 preset=smoke noise.levels=[0.002]`, the
+output a configuration in three forms, each computed from the previous one:
 
 1. `compose`: a tree of plain values, defaults of the settings' classes included;
 2. `load` (a whole dataset) and `load_stage` (the groups that a stage reads): checked models;
 3. `write_settings`: a YAML file of these groups for a job, which `load_settings` reads again.
 
-`overrides_for` selects those of a workflow's overrides that concern one dataset.
+`select_overrides` selects the overrides of a workflow that concern one dataset.
 """
 
 from __future__ import annotations
@@ -25,18 +25,23 @@ from psfdae.base.errors import did_you_mean
 from psfdae.base.files import ProductError, write_text
 from psfdae.base.reading import parse_yaml
 from psfdae.base.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
-from psfdae_paper.configuration.aligners import trained_networks
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.consistency import stage_model, with_derived_values
-from psfdae_paper.configuration.methods import all_groups, methods_in
-from psfdae_paper.configuration.schema import Config, whole_config
+from psfdae_paper.configuration.consistency import build_stage_class, fill_derived_values
+from psfdae_paper.configuration.estimators import list_trained_networks
+from psfdae_paper.configuration.methods import list_method_groups, methods_in
+from psfdae_paper.configuration.schema import Config, build_config_class
 
 
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Resolve a list of Hydra overrides to a configuration tree, not yet checked.
 
     Hydra takes about 0.25 s for each list; the same list is composed once in a process.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Such as `dataset=dataset3`, `preset=smoke` or `noise.levels=[0.002]`.
 
     Returns
     -------
@@ -46,24 +51,19 @@ def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        If Hydra refuses an override (unknown key or group option, bad syntax).
-
-    Parameters
-    ----------
-    overrides : sequence of str
-        Such as `dataset=dataset3`, `preset=smoke` or `noise.levels=[0.002]`.
+        If Hydra rejects an override (unknown key or group option, bad syntax).
     """
-    return _composed(tuple(overrides))
+    return _compose_with_hydra(tuple(overrides))
 
 
 def clear_caches() -> None:
     """Compose everything anew, for example after a change of the config folder."""
-    _composed.cache_clear()
+    _compose_with_hydra.cache_clear()
     methods_in.cache_clear()
 
 
 @cache
-def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
+def _compose_with_hydra(overrides: tuple[str, ...]) -> dict[str, Any]:
     """Compose with Hydra, and resolve all references between keys."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
@@ -76,13 +76,13 @@ def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(folder), overrides=list(overrides))
         # Plain values, with ${…} replaced by the keys that they name.
-        resolved: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
-    except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
+        values: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
+    except Exception as error:  # a broken file can raise nearly any error inside Hydra
         raise ConfigError(_reason(error, folder)) from error
     # A root file that is a list or a number.
-    if not isinstance(resolved, dict):
+    if not isinstance(values, dict):
         raise ConfigError(f"{folder / 'config.yaml'}: must be a mapping")
-    return resolved
+    return values
 
 
 def _primary(folder: Path) -> str:
@@ -105,10 +105,10 @@ def _primary(folder: Path) -> str:
     class_defaults = {name: values for name, values in class_defaults.items() if values}
     tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
-    # The root file has settings of our own methods; those of other packages have files of their
-    # own, which come before its list: datasets and presets may change them.
+    # The root file has settings of our own methods. Methods of other packages have their own files,
+    # which come before its list: datasets and presets may change them.
     method_defaults = [
-        {f"optional {group}": "default"} for group in sorted({*all_groups()} - tree.keys())
+        {f"optional {group}": "default"} for group in sorted({*list_method_groups()} - tree.keys())
     ]
     # From the weakest to the strongest.
     all_defaults = ["class_defaults", *method_defaults, *defaults]
@@ -123,39 +123,39 @@ def _group_classes() -> dict[str, type[Group]]:
     """Return the classes of the configuration's groups by name."""
     return {
         name: field.annotation
-        for name, field in whole_config().model_fields.items()
+        for name, field in build_config_class().model_fields.items()
         if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
     }
 
 
 def _reason(error: Exception, folder: Path) -> str:
-    """Return one line on why a composition failed: the file that is no YAML, if there is one.
+    """Return one line on why a composition failed, with the damaged file if there is one.
 
-    Hydra's own refusals name the key or option. Any other error comes from a damaged file, which
+    Hydra's own errors name the key or option. Any other error comes from a damaged file, which
     Hydra does not name: the files are read one by one until one of them fails.
 
     Parameters
     ----------
     error : Exception
-        What Hydra, or a library below it, raised.
+        Error of Hydra, or of a library below it.
     folder : Path
         Folder of the configuration.
     """
     from hydra.errors import HydraException, MissingConfigException, OverrideParseException
     from omegaconf.errors import OmegaConfBaseException
 
-    # An option of a group that does not exist: those that there are, the likeliest first.
+    # An unknown option of a group: the message lists the options that exist.
     if isinstance(error, MissingConfigException) and error.options:
         group, _, option = str(error.missing_cfg_file).partition("/")
         options = [name for name in error.options if not name.startswith("_")]
         hint = did_you_mean(option, options)
         return f"{group}={option}: no such option; there are {', '.join(options)}{hint}"
     if isinstance(error, OverrideParseException):
-        # Lines of Hydra's message but its heading and the address of its manual.
+        # Lines of Hydra's message without its heading and the address of its manual.
         lines = re.sub("^(Error parsing override|See) .*", "", str(error), flags=re.M).split("\n")
         problem = " ".join(filter(None, lines))
         return f"{error.override}: expected key=value as Hydra reads it ({problem})"
-    # A key that does not exist: Hydra's advice is to add it, which the check would refuse.
+    # An unknown key: Hydra's advice is to add it, which the check would reject.
     if unknown := re.match("Could not override '(.+?)'", str(error)):
         keys = [*_group_classes(), *(key for key, _ in leaves(compose()))]
         return f"{unknown[1]}: unknown key{did_you_mean(unknown[1], keys)}"
@@ -174,15 +174,15 @@ def _reason(error: Exception, folder: Path) -> str:
 def load(overrides: Sequence[str] = ()) -> Config:
     """Compose and check the whole configuration of a dataset, or all that scene 3 reads of it.
 
-    Raises
-    ------
-    ConfigError
-        Names each wrong key with its value and the allowed range.
-
     Parameters
     ----------
     overrides : sequence of str
         As of `compose`.
+
+    Raises
+    ------
+    ConfigError
+        Names each wrong key with its value and the allowed range.
     """
     return validate_tree(compose(overrides))
 
@@ -200,13 +200,13 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
     Config
         Lengths in metres, angles in the unit that their key names.
     """
-    # A dataset has all groups; scene 3 reads only some, and none of stars.
+    # A dataset has all groups; scene 3 reads only some, without the groups of stars.
     if not _is_alignment(tree):
-        return parse_settings(whole_config(), tree)
+        return parse_settings(build_config_class(), tree)
     _require_known_groups(tree)
     reads = (
         *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
-        *("cnn", "perceptron", *(f"train_{name}" for name in trained_networks())),
+        *("cnn", "perceptron", *(f"train_{name}" for name in list_trained_networks())),
         *("evaluation", "fit"),
     )
     return part(reads, tree)
@@ -214,7 +214,7 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
 
 def _is_alignment(tree: Mapping[str, Any]) -> bool:
     """Return True for the configuration of scene 3."""
-    # A group may be damaged, and is then refused by the check of all groups.
+    # A damaged group is rejected later, by the check of all groups.
     dataset = tree.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else None
     return "scene" not in tree and name == "alignment"
@@ -223,7 +223,7 @@ def _is_alignment(tree: Mapping[str, Any]) -> bool:
 def _require_known_groups(tree: Mapping[str, Any]) -> None:
     """Raise ConfigError if a tree has a group that the configuration does not have."""
     # Groups that a user adds by mistake would be ignored otherwise.
-    names = whole_config().model_fields
+    names = build_config_class().model_fields
     if unknown := sorted(set(tree) - set(names)):
         raise ConfigError(f"{unknown[0]}: unknown key{did_you_mean(unknown[0], names)}")
 
@@ -234,17 +234,17 @@ Model = TypeVar("Model", bound=Group)
 def load_file(model: type[Model], path: Path) -> Model:
     """Read and check a file of the configuration that Hydra does not compose.
 
-    Raises
-    ------
-    ConfigError
-        One line per finding: file, key, what is allowed.
-
     Parameters
     ----------
     model : type of Group
         Class with the keys of the file, such as `Sweep`.
     path : Path
         YAML file.
+
+    Raises
+    ------
+    ConfigError
+        One line per wrong key: file, key, allowed values.
     """
     from omegaconf import OmegaConf
 
@@ -256,12 +256,12 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    with _named_in_errors(path):
+    with _name_in_errors(path):
         return parse_settings(model, tree if isinstance(tree, dict) else {})
 
 
 @contextmanager
-def _named_in_errors(path: Path) -> Iterator[None]:
+def _name_in_errors(path: Path) -> Iterator[None]:
     """Begin each line of a ConfigError with the name of the file that is checked."""
     try:
         yield
@@ -274,6 +274,13 @@ def _named_in_errors(path: Path) -> Iterator[None]:
 def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     """Compose the configuration and check the groups that a stage reads.
 
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups.
+    overrides : sequence of str
+        As of `compose`.
+
     Returns
     -------
     Config
@@ -283,27 +290,15 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     ------
     ConfigError
         Names each wrong key with its value and the allowed range, and unknown groups.
-
-    Parameters
-    ----------
-    reads : tuple of str
-        Names of the groups.
-    overrides : sequence of str
-        As of `compose`.
     """
-    # A misspelt group is refused, even though the stage would not read it.
+    # A misspelt group is rejected, even though the stage would not read it.
     tree = compose(overrides)
     _require_known_groups(tree)
-    return part(reads, stage_tree(reads, tree))
+    return part(reads, select_stage_groups(reads, tree))
 
 
 def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     """Read the groups of a stage from a file that `write_settings` has written.
-
-    Raises
-    ------
-    ConfigError, ProductError
-        If the file is no YAML or has other groups; names file, key and range.
 
     Parameters
     ----------
@@ -311,13 +306,18 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
         YAML file.
     reads : tuple of str
         Names of the groups that it must have, and no others.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If the file is not YAML or has other groups; names file, key and range.
     """
     tree = parse_yaml(path)
-    # A file that is no mapping lacks all groups.
+    # A file that is not a mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
-    # All groups of the file are checked: one that the stage does not read is refused.
-    with _named_in_errors(path):
-        return _checked(reads, groups)
+    # All groups of the file are checked: one that the stage does not read is rejected.
+    with _name_in_errors(path):
+        return _check_groups(reads, groups)
 
 
 def write_settings(
@@ -352,10 +352,10 @@ def write_settings(
     import yaml
 
     # Checked values in the order of the classes.
-    settings = part(reads, stage_tree(reads, tree)).model_dump()
-    # The name is a hash of what can change the result: another name makes Snakemake repeat a job.
-    serialised = json.dumps(decisive_settings(settings), sort_keys=True)
-    digest = hashlib.sha256(serialised.encode()).hexdigest()
+    settings = part(reads, select_stage_groups(reads, tree)).model_dump()
+    # The name is a hash of the decisive settings: another name makes Snakemake repeat a job.
+    settings_text = json.dumps(drop_neutral_settings(settings), sort_keys=True)
+    digest = hashlib.sha256(settings_text.encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
     # A dry run writes nothing; jobs on other machines read the same file.
     if not dry:
@@ -369,35 +369,42 @@ def write_settings(
 def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     """Select and check some groups of a configuration, which is a tree or a model.
 
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups. Groups that the configuration lacks are missing in the result, which
+        is rejected.
+    tree : mapping or Group
+        Composed configuration.
+
     Raises
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
-
-    Parameters
-    ----------
-    reads : tuple of str
-        Names of the groups; those that the configuration lacks are missing in the result, which is
-        refused.
-    tree : mapping or Group
-        Composed configuration.
     """
     # A model becomes a tree again, so that it is checked anew.
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     groups = {key: tree[key] for key in reads if key in tree}
-    return _checked(reads, groups)
+    return _check_groups(reads, groups)
 
 
-def _checked(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
-    """Return checked groups; type checkers take them for a whole `Config`, as stages state it."""
-    # `stage_model` makes a class of these groups alone.
-    return cast(Config, parse_settings(stage_model(reads, whole_config()), groups))
+def _check_groups(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
+    """Return checked groups, annotated as a whole `Config` as in the stages."""
+    # `build_stage_class` makes a class of these groups alone.
+    return cast(Config, parse_settings(build_stage_class(reads, build_config_class()), groups))
 
 
-def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
+def select_stage_groups(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
     """Select the groups of a configuration tree that a stage reads.
 
     Values that follow from groups that it does not read are filled in.
+
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups.
+    tree : mapping
+        Composed configuration.
 
     Raises
     ------
@@ -407,10 +414,10 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     # Values that are null in the files because they follow from other groups.
     try:
         # Edge and spacing of fields, and search distances in pixels.
-        tree = with_derived_values(tree)
+        tree = fill_derived_values(tree)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    # Scene 3 has no stars, and other datasets no states: a stage of the other kind is told so.
+    # Scene 3 lacks stars, and other datasets lack states: a stage of the other kind fails.
     missing = [key for key in reads if key not in tree]
     if missing and _is_alignment(tree):
         raise ConfigError(
@@ -422,30 +429,31 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     return {key: tree[key] for key in reads}
 
 
-def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple[str, ...]:
-    """Select those of a workflow's overrides that concern a dataset.
+def select_overrides(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple[str, ...]:
+    """Select the overrides of a workflow that concern a dataset.
 
     The workflow takes one list for everything. A key that only other datasets have is left
-    out; one that no dataset has stays, so that it is refused by name. Options of a group, such as
-    telescope=wfsat_literal, apply to all datasets, but to scene 3 only presets.
+    out; a key that is unknown to all datasets is kept, so that it is rejected by name. Options of a
+    group, such as telescope=wfsat_literal, apply to all datasets, but to scene 3 only presets.
 
     Parameters
     ----------
     overrides : sequence of str
+        Hydra overrides of the workflow, such as noise.kappa=4.98.
     choice : sequence of str
         Override that chooses the dataset, such as dataset=dataset7.
-
-    Raises
-    ------
-    ConfigError
-        If an option does not exist.
 
     Returns
     -------
     tuple of str
         Overrides in the order in which they were given.
+
+    Raises
+    ------
+    ConfigError
+        If an option does not exist.
     """
-    # Words such as preset=smoke choose a file of a group; scene 3 has a telescope of its own.
+    # Words such as preset=smoke choose a file of a group; scene 3 has its own telescope.
     options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
     applicable_options = options
     if tuple(choice) == Alignment.choice:
@@ -463,8 +471,8 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
 
     def concerns(override: str) -> bool:
         """Return True if this dataset has the override's key, or if no dataset has it."""
-        # `key=value` changes a key; `+group.key=value` adds one to a group, which must be there;
-        # `++group.key=value` does either, hence first the key and then the group decides.
+        # `key=value` changes a key; `+group.key=value` adds a key to an existing group;
+        # `++group.key=value` does either, hence the key decides first, then the group.
         key = _key(override)
         keys = [] if override.startswith("+") and not override.startswith("++") else [key]
         keys += [key.rpartition(".")[0]] if override.startswith("+") and "." in key else []
@@ -472,7 +480,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
         for key in keys:
             if has_key(choice, key):
                 return True
-            if any(has_key([f"dataset={name}"], key) for name in dataset_names()):
+            if any(has_key([f"dataset={name}"], key) for name in list_datasets()):
                 return False
         return True
 
@@ -483,8 +491,8 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     )
 
 
-def dataset_names() -> list[str]:
-    """Return the options of the group dataset, without those that other files start from."""
+def list_datasets() -> list[str]:
+    """Return the options of the group dataset, except files that are bases of others."""
     return sorted(path.stem for path in config_dir().glob("dataset/[!_]*.yaml"))
 
 
@@ -493,7 +501,7 @@ def _key(override: str) -> str:
     return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
 
 
-def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
+def drop_neutral_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration tree without the settings that cannot change a result.
 
     These are marked `NEUTRAL` in their class, such as the time between checkpoints.
@@ -506,7 +514,7 @@ def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        What a hash is made of: settings with the same hash give the same result.
+        Input of the hash: settings with the same hash give the same result.
     """
     neutral = {
         (group, name)
@@ -524,6 +532,6 @@ def decisive_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _first_lines(error: Exception) -> str:
     """Return the first two lines of an error's text as one line."""
-    # Hydra and OmegaConf explain themselves at length.
+    # Messages of Hydra and OmegaConf are long.
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines[:2])

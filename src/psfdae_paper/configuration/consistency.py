@@ -1,7 +1,7 @@
 """Relations between groups of the configuration: derived values and contradictions.
 
-In goes a composed tree of groups, in which some values are null because they follow from other
-groups; out comes the same tree with these values, or an error where groups contradict each other.
+The input is a composed tree of groups, in which some values are null because they follow from other
+groups. The output is the same tree with these values, or an error if groups contradict each other.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import ConfigDict, ValidationError, create_model, model_validator
 
 from psfdae.base.settings import Group, leaves
 from psfdae.telescope.settings import Telescope, has_own_aberrations
-from psfdae_paper.configuration.base import search_distance
+from psfdae_paper.configuration.base import get_search_distance
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
@@ -48,30 +48,30 @@ class Consistent(Group):
         Returns
         -------
         object
-            The groups by `with_derived_values`.
+            The groups by `fill_derived_values`.
         """
         if not isinstance(tree, Mapping):
             return tree
-        return with_derived_values(tree)
+        return fill_derived_values(tree)
 
     @model_validator(mode="before")
     @classmethod
     def check_scene(cls, tree: object) -> object:
-        """Refuse a scene and a telescope that do not have the same source of aberrations.
+        """Require that exactly one of scene and telescope has aberrations.
 
-        The aberrations are settings of the scene or of the telescope: exactly one of them has some.
+        The aberrations are settings of either the scene or the telescope.
 
         Raises
         ------
         ValueError
-            With the telescope, its scene, and a dataset that would do.
+            With the telescope, its scene, and a suitable dataset.
         """
         groups: Mapping[str, Any] = tree if isinstance(tree, Mapping) else {}
         # Scene 3 has no group `scene`; its misalignments are aberrations of its own.
         scene, telescope = groups.get("scene"), groups.get("telescope")
         if scene is None and "alignment" in groups:
             scene = {"name": "alignment"}
-        # Groups that a stage does not read are absent; others than mappings are refused later.
+        # Groups that a stage does not read are absent; anything but mappings is rejected later.
         if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
             return tree
         name, has_aberrations = telescope.get("name"), has_own_aberrations(telescope)
@@ -90,14 +90,14 @@ class Consistent(Group):
 
     @model_validator(mode="after")
     def check_jitter(self) -> Consistent:
-        """Refuse a jitter of aberrations for stars that have no random aberrations.
+        """Reject a jitter of aberrations for stars without random aberrations.
 
         Raises
         ------
         ValueError
             With both keys.
         """
-        # Groups that a stage does not read are absent, and telescopes may have no aberrations.
+        # Groups that a stage does not read are absent, and a telescope may lack aberrations.
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
         # In waves RMS; own telescopes alone have it.
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
@@ -131,7 +131,7 @@ class Consistent(Group):
         return self
 
 
-def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
+def fill_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration with values for those nulls that follow from other groups.
 
     The tree need not be valid: a value that cannot be derived from it is left to the next check.
@@ -148,39 +148,39 @@ def with_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
         `framing.search_px` and `stars.search_px` in pixels.
     """
     # Copies of the groups, in which nulls are replaced.
-    derived = {
+    groups = {
         name: dict(group) if isinstance(group, Mapping) else group for name, group in tree.items()
     }
-    telescope, grid = derived.get("telescope"), derived.get("grid")
+    telescope, grid = groups.get("telescope"), groups.get("grid")
     if isinstance(telescope, dict):
-        # Width of a pixel in λ/D, from the aperture, the wavelength and the pixel scale. Settings
-        # that the next check refuses have none, and any number is right.
+        # Width of a pixel in λ/D, from the aperture, the wavelength and the pixel scale. For wrong
+        # settings, which the next check rejects, any number is right.
         keys = [key for key in Telescope.model_fields if key in telescope]
         try:
             pixel = Telescope.model_validate({key: telescope[key] for key in keys}).pixel or 1.0
         except ValidationError:
             pixel = 1.0
         # Brightest pixels are searched within a distance in λ/D, whatever the telescope's pixels.
-        for group in (derived.get("framing"), derived.get("stars")):
+        for group in (groups.get("framing"), groups.get("stars")):
             if isinstance(group, dict) and group.get("search_px", 0) is None:
-                distance = search_distance(group.get("search_lambda_d"))
+                distance = get_search_distance(group.get("search_lambda_d"))
                 # Stamps between 4 and 256 pixels on either side of the chief ray.
                 group["search_px"] = int(np.clip(np.ceil(distance / pixel), 4, 256))
         # The relative field H is 1 at the edge of the telescope's field.
         if isinstance(grid, dict) and grid.get("edge_deg", 0) is None:
             grid["edge_deg"] = telescope.get("field_edge_deg")
     if isinstance(grid, dict) and grid.get("spacing_deg", 0) is None:
-        # The outermost field points are at the edge of the field. One point has no neighbour, for
-        # which any distance is right; `points` that are no integer are refused by the next check.
+        # The outermost field points are at the edge of the field. For a single point any distance
+        # is right; `points` that are not an integer are rejected by the next check.
         edge, points = grid.get("edge_deg"), grid.get("points")
         if isinstance(edge, int | float):
             # n points have n − 1 intervals.
             intervals = max(points - 1, 1) if isinstance(points, int) else 2
             grid["spacing_deg"] = 2.0 * edge / intervals
-    return derived
+    return groups
 
 
-def simulation_changes(
+def compare_simulations(
     dataset: Mapping[str, Any], stars: Mapping[str, Any]
 ) -> list[tuple[str, object, object]]:
     """Return the simulation settings in which a dataset differs from the file of its stars.
@@ -209,7 +209,7 @@ def simulation_changes(
 
 
 @cache
-def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
+def build_stage_class(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consistent]:
     """Return a model of some groups of a whole configuration.
 
     Parameters
@@ -217,14 +217,14 @@ def stage_model(keys: tuple[str, ...], whole_model: type[Group]) -> type[Consist
     keys : tuple of str
         Names of the groups.
     whole_model : type of Group
-        Class that has them, such as that of `schema.whole_config`.
+        Class that has them, such as the result of `schema.build_config_class`.
 
     Returns
     -------
     type of Consistent
-        A class that refuses any other group, and checks relations between those that it has.
+        A class that rejects any other group, and checks relations between its groups.
     """
-    # Fields keep their types, but none is optional: a stage needs all groups that it names.
+    # Fields keep their types, but all are required: a stage needs all groups that it names.
     fields: dict[str, Any] = {
         key: (whole_model.model_fields[key].rebuild_annotation(), ...) for key in keys
     }

@@ -1,7 +1,7 @@
-"""The methods of the configuration: those of the list in `config.yaml`, in the order of tables.
+"""The methods that `config.yaml` lists, in the order of tables.
 
-In goes the list `methods` of names; out come the classes of the methods and the groups of the
-configuration that are their settings. A method that is plugged in needs nothing but its name there.
+The input is the list `methods` of names, the output the classes of the methods and the groups of
+the configuration with their settings. For a method of another package, its name there is enough.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from psfdae.methods.interface import Method
 from psfdae_paper.configuration.base import config_dir
 
 
-def registered() -> tuple[type[Method], ...]:
+def list_methods() -> tuple[type[Method], ...]:
     """Return the methods that the configuration lists, in the order of tables; then all others.
 
     Raises
@@ -33,7 +33,7 @@ def registered() -> tuple[type[Method], ...]:
 def methods_in(path: Path) -> tuple[type[Method], ...]:
     """Return the methods that a file `config.yaml` lists, then all others.
 
-    Raises ConfigError as `registered` does.
+    Raises ConfigError as `list_methods` does.
 
     Parameters
     ----------
@@ -51,38 +51,38 @@ def methods_in(path: Path) -> tuple[type[Method], ...]:
         names = tree.get("methods") if isinstance(tree, dict) else None
         if not isinstance(names, list) or len({*map(str, names)}) < len(names):
             raise ProductError("methods: must be a list of different names")
-        listed = tuple(method(str(name)) for name in names)
+        methods = tuple(method(str(name)) for name in names)
     except ProductError as error:
-        # Errors of the file name it already; those of a method do not.
+        # Errors of the file name it already; errors of a method do not.
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     # Registered methods that are not listed may still be asked for by name.
-    return (*listed, *(kind for kind in all_methods() if kind not in listed))
+    return (*methods, *(kind for kind in all_methods() if kind not in methods))
 
 
-def all_groups() -> tuple[str, ...]:
+def list_method_groups() -> tuple[str, ...]:
     """Return the groups of the configuration that are settings of methods, each once.
 
     Methods may share a group, such as both Gaussian mixtures.
     """
-    return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
+    return tuple(dict.fromkeys(group for kind in list_methods() for group in kind.groups))
 
 
-def oracles_last(names: Iterable[str]) -> list[type[Method]]:
-    """Return the methods of some names in the order of legends: those that are given λ last.
+def sort_oracles_last(names: Iterable[str]) -> list[type[Method]]:
+    """Return the methods with these names in the order of legends: methods that are given λ last.
 
-    Within both kinds the order is that of the configuration.
+    Within both kinds they have the order of the configuration.
 
     Parameters
     ----------
     names : iterable of str
-        Names of methods; those that are not registered are passed over.
+        Names of methods; names that are not registered are skipped.
 
     Returns
     -------
     list of type of Method
-        Methods that know the noise level have an advantage in comparisons, and stand apart.
+        Methods that know the noise level have an advantage in comparisons, and come last.
     """
     # `sorted` keeps the order of equals.
-    kinds = [kind for kind in registered() if kind.name in set(names)]
+    kinds = [kind for kind in list_methods() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

@@ -1,7 +1,7 @@
 """Every configuration key with its type, unit, range and meaning.
 
-A class is a group of `config/`, and a field of it one key; files hold only what differs from the
-defaults here. `Config` has all groups, and checks values of one group against those of others.
+A class is a group of `config/`, and a field of it one key; files hold only values other than the
+defaults here. `Config` has all groups, and checks the values of each group against other groups.
 
 Lengths are in metres and angles in the unit that their name carries; the science code receives SI
 units (`Telescope.pixel_scale` is in radians).
@@ -34,11 +34,11 @@ from psfdae.methods.interface import Method
 from psfdae.methods.networks.settings import DaeSettings, Train
 from psfdae.telescope.aberrations import Prescription, Seidel
 from psfdae.telescope.settings import AnyTelescope
-from psfdae_paper.configuration.aligners import trained_networks
 from psfdae_paper.configuration.alignment import Alignment, Cnn, Fit, NetworkTrain, Perceptron
-from psfdae_paper.configuration.base import SearchDistance, search_distance
+from psfdae_paper.configuration.base import SearchDistance, get_search_distance
 from psfdae_paper.configuration.consistency import Consistent
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.estimators import list_trained_networks
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
 
 
@@ -54,11 +54,11 @@ class Grid(Group):
     spacing_deg: Positive
     """Distance of neighbouring field points; null: the outermost lie at edge_deg."""
     edge_deg: Positive
-    """Field angle at which the relative field H is 1; null: that of the telescope."""
+    """Field angle at which the relative field H is 1; null: the edge of the telescope's field."""
 
 
 class Scene(Group):
-    """A family of static PSFs: what causes the aberrations of the telescope."""
+    """A family of static PSFs with one cause of the telescope's aberrations."""
 
     name: Literal["seidel", "turbulence", "telescope"]
     """Module that makes its wavefronts."""
@@ -69,7 +69,7 @@ class Scene(Group):
 class Stars(Group):
     """A set of noise-free stars, shared by all datasets that only differ in noise.
 
-    Aberrations of a star are those of its field, each times 1 + `aberration_fraction` · N(0, 1).
+    A star has the aberrations of its field, each times 1 + `aberration_fraction` · N(0, 1).
     """
 
     name: Name
@@ -82,7 +82,7 @@ class Stars(Group):
     """Relative standard deviation of every aberration term."""
     search_px: Annotated[int, Field(ge=4, le=512)]
     """Search distance for the brightest pixel of a star; null: search_lambda_d."""
-    search_lambda_d: SearchDistance = search_distance()
+    search_lambda_d: SearchDistance = get_search_distance()
     """The same in λ/D of whatever telescope, if search_px is null."""
 
 
@@ -95,7 +95,7 @@ class Framing(Stamp):
     search_px: Annotated[int, Field(ge=4, le=512)]
     """A template's brightest pixel is searched within ± this of the chief ray; null:
     search_lambda_d."""
-    search_lambda_d: SearchDistance = search_distance()
+    search_lambda_d: SearchDistance = get_search_distance()
     """The same in λ/D of whatever telescope, if search_px is null."""
     # Mirror-symmetric PSFs have equal maxima, between which rounding would choose.
     tie: Annotated[float, Field(ge=0, lt=0.1)]
@@ -142,10 +142,10 @@ class Optics(WholePeriodOptics):
     """Library of the matrix products."""
 
 
-def checked_optics(tree: object) -> object:
+def check_optics(tree: object) -> object:
     """Check settings of the optics by the class that has their keys.
 
-    Scene 3 propagates the whole period of the image and has no choice of a backend.
+    Scene 3 propagates the whole period of the image, without a choice of the backend.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def checked_optics(tree: object) -> object:
     Returns
     -------
     Optics or WholePeriodOptics
-        Checked settings; anything but a mapping is returned as it is, and refused by its type.
+        Checked settings; anything but a mapping is returned unchanged, and rejected by its type.
     """
     if not isinstance(tree, Mapping):
         return tree
@@ -166,13 +166,13 @@ if TYPE_CHECKING:
     # Every dataset with a scene has it (`Consistent`); scene 3 reads the base class only.
     AnyOptics = Optics
 else:
-    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(checked_optics)]
+    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(check_optics)]
 
 
 class Dataset(Group):
     """A dataset of the paper: stars, a noise band, splits and references.
 
-    Its name is that of its file. Every split and reference has trainings and tables of its own.
+    It has the name of its file. Every split and reference has its own trainings and tables.
     """
 
     name: Name
@@ -187,7 +187,7 @@ class Dataset(Group):
 
 
 class Calibration(Group):
-    """Scan of parameters that the paper does not state: pixel scale, r0, range of the SSIM.
+    """Scan of parameters that the paper does not give: pixel scale, r0, range of the SSIM.
 
     Stage `scan` computes the SSIM of noisy stars on this grid, and `calibrate` fits it to the rows
     of the paper's tables that depend on no method.
@@ -198,7 +198,7 @@ class Calibration(Group):
     pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)]
     """Pixel scales scanned, ascending."""
     r0_m: Annotated[list[Positive], Field(min_length=1)]
-    """Fried parameters scanned (scene 2; scene 1 has none)."""
+    """Fried parameters scanned (of scene 2 only)."""
     # The SSIM has constants in proportion to the square of the dynamic range.
     data_ranges: Annotated[list[Positive], Field(min_length=2)]
     """SSIM dynamic ranges scanned, ascending."""
@@ -255,8 +255,8 @@ class Workflow(Group):
 class Config(Consistent):
     """The whole configuration of one dataset.
 
-    Stages get a model with those of these groups that they read, and annotate it as `Config`, too.
-    Scene 3 reads those that `compose.validate_tree` names. `whole_config` adds settings of methods.
+    Stages get a model with the groups that they read, and annotate it as `Config`, too. Scene 3
+    reads the groups that `compose.validate_tree` lists. `build_config_class` adds methods' groups.
     """
 
     if TYPE_CHECKING:
@@ -293,14 +293,14 @@ class Config(Consistent):
 
     @model_validator(mode="after")
     def check_groups(self) -> Config:
-        """Refuse values of single groups that contradict those of other groups.
+        """Reject values that contradict the values of other groups.
 
         Raises
         ------
         ValueError
             With the keys of both groups and their values.
         """
-        # Parts for training (with validation) and test have no star in common.
+        # Parts for training (with validation) and test do not share stars.
         part_stars = self.parts.train_stars + self.parts.test_stars
         if part_stars > self.stars.count:
             raise ValueError(
@@ -318,13 +318,13 @@ class Config(Consistent):
                 "framing.subpixel = true: stars.aberration_fraction must be above 0, "
                 "stars without random aberrations are their templates"
             )
-        # Settings of a method against those of the data.
-        for method in registered():
+        # Settings of a method against settings of the data.
+        for method in list_methods():
             method.check(self)
         return self
 
 
-def whole_config() -> type[Config]:
+def build_config_class() -> type[Config]:
     """Return `Config` with the settings of all methods, and of the trainings of scene 3.
 
     Methods that are plugged in add groups, so that the class is made when it is first used.
@@ -334,15 +334,15 @@ def whole_config() -> type[Config]:
     type of Config
         The class that `compose.load` checks a dataset by, with a field for each group.
     """
-    return _with_settings(registered())
+    return _add_settings(list_methods())
 
 
 @cache
-def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
+def _add_settings(methods: tuple[type[Method], ...]) -> type[Config]:
     """Return the model with the settings of some methods; it is made only once."""
     # Settings of methods and of the networks of scene 3; none has a default of its own.
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }
-    groups |= {f"train_{name}": (NetworkTrain, ...) for name in trained_networks()}
+    groups |= {f"train_{name}": (NetworkTrain, ...) for name in list_trained_networks()}
     return create_model("Config", __base__=Config, **groups)

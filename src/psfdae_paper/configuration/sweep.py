@@ -1,7 +1,7 @@
-"""Configuration of a sweep (`config/sweep/*.yaml`): what is varied, and how the best is chosen.
+"""Configuration of a sweep (`config/sweep/*.yaml`): its axes, and the choice of the best point.
 
-In goes a file such as `config/sweep/dae_width.yaml`; out comes a checked `Sweep`. Its points are
-made from it by `psfdae_paper.sweeps.points`.
+The input is a file such as `config/sweep/dae_width.yaml`, the output a checked `Sweep`.
+`psfdae_paper.sweeps.points` computes its points.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pydantic import Field, field_validator, model_validator
 from psfdae.base.errors import did_you_mean
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import list_groups, method
-from psfdae_paper.configuration.aligners import ESTIMATORS, swept_networks
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load_file
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.estimators import ESTIMATORS, list_swept_networks
+from psfdae_paper.configuration.methods import list_methods
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
@@ -48,7 +48,7 @@ class Axis(Group):
     """A range that is even in the logarithm."""
     integer: bool = False
     """A range of whole numbers."""
-    # What the value of the axis changes.
+    # Keys to which the value of the axis is written.
     keys: Annotated[list[str], Field(min_length=1)] | None = None
     """Configuration keys that get the value; default: the axis' name."""
     repeat: Count | None = None
@@ -68,7 +68,7 @@ class Axis(Group):
         -------
         object
             The same as a mapping with the keys of this class; anything else is left to the check of
-            the types, which refuses it.
+            the types, which rejects it.
         """
         # YAML reads a name such as 3 as a number; names of choices are text.
         if isinstance(tree, list):
@@ -84,10 +84,10 @@ class Axis(Group):
         Raises
         ------
         ValueError
-            If there are no or several forms, a range is empty or lacks an end, or keys of another
-            form are there.
+            If there is not exactly one form, a range is empty or lacks an end, or keys of another
+            form are given.
         """
-        # Both ends of a range count as one form.
+        # Both ends of a range together are one form.
         end_count = (self.low is not None) + (self.high is not None)
         form_count = (self.values is not None) + (self.choices is not None) + (end_count > 0)
         if form_count != 1 or end_count == 1:
@@ -103,7 +103,7 @@ class Axis(Group):
                 raise ValueError(f"low = {self.low:g}: must be above 0 on a logarithmic range")
             if self.integer and not (self.low.is_integer() and self.high.is_integer()):
                 raise ValueError(f"low = {self.low:g}, high = {self.high:g}: must be whole numbers")
-        # Listed values say by themselves what they are.
+        # The type of listed values is clear from the values.
         elif self.log or self.integer:
             raise ValueError("log and integer belong to a range, low and high")
         return self
@@ -123,8 +123,8 @@ class Axis(Group):
     def changes(self, name: str, value: Value) -> dict[str, Value]:
         """Return the configuration keys and their values at a value of the axis `name`.
 
-        A choice brings its own keys; any other value goes to `keys`, or to the key that the axis
-        is named by, as a list of equal numbers if `repeat` is given.
+        A choice brings its own keys; any other value is set in `keys`, or in the key that names
+        the axis, as a list of equal numbers if `repeat` is given.
 
         Parameters
         ----------
@@ -155,9 +155,9 @@ class Sweep(Group):
     best one.
     """
 
-    # What is trained, and on which data.
+    # Model and data of the trainings.
     kind: Literal["grid", "random", "adaptive"]
-    """Every combination, random draws, or draws that learn from earlier ones."""
+    """Every combination, random draws, or draws that depend on earlier results."""
     model: str
     """Method, or one of scene 3's networks."""
     dataset: Name | None = None
@@ -171,18 +171,18 @@ class Sweep(Group):
     """Chooses the best point: over all noise levels."""
     direction: Literal["minimize", "maximize"]
     """Direction of a better metric."""
-    # What all points share, and what is varied.
+    # Settings that all points share, and settings that are varied.
     overrides: dict[AxisName, Value] = Field(default={})
     """Configuration keys that all points share."""
     space: Annotated[dict[AxisName, Axis], Field(min_length=1)]
     """Axes that are varied, by name."""
     # Of random and adaptive sweeps.
     trials: Count | None = None
-    """Number of draws; a grid has none."""
+    """Number of draws; not for a grid."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the draws."""
     startup: Count = 4
-    """Adaptive: random trials before it learns."""
+    """Adaptive: random trials at the start."""
     parallel: Count = 2
     """Adaptive: trials that may run at once."""
 
@@ -197,8 +197,8 @@ class Sweep(Group):
             With the names that are allowed.
         """
         # Methods without a file have nothing to train.
-        stored = (method_class.name for method_class in registered() if method_class.storage)
-        models = (*stored, *swept_networks())
+        names = (method_class.name for method_class in list_methods() if method_class.storage)
+        models = (*names, *list_swept_networks())
         if name not in models:
             raise ValueError(f"{name!r} is not one of {', '.join(models)}")
         return name
@@ -211,14 +211,14 @@ class Sweep(Group):
     @property
     def reads(self) -> tuple[str, ...]:
         """Groups of the configuration that decide a point."""
-        return point_groups(self.model)
+        return list_point_groups(self.model)
 
     @property
     def varied(self) -> tuple[str, ...]:
         """Keys and groups that may differ between points; all points share their stars."""
         return (
             ESTIMATORS[self.model].swept
-            if self.model in swept_networks()
+            if self.model in list_swept_networks()
             else (*method(self.model).groups, "noise.levels")
         )
 
@@ -235,11 +235,11 @@ class Sweep(Group):
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         # Methods restore the stars of a dataset; networks of scene 3 have states.
-        if (self.model in swept_networks()) != (self.dataset is None):
+        if (self.model in list_swept_networks()) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
         if self.choice == Alignment.choice and self.dataset is not None:
             raise ValueError(f"dataset = {self.dataset}: scene 3 has no stars that methods restore")
-        # Networks of scene 3 err in states of misalignment, methods in images of stars.
+        # Networks of scene 3 have errors of states of misalignment, methods of images of stars.
         metrics = ["validation_mae"]
         if self.dataset is not None:
             metrics = ["validation_mse", "validation_ssim"]
@@ -251,36 +251,36 @@ class Sweep(Group):
 
     @model_validator(mode="after")
     def check_axes(self) -> Sweep:
-        """Refuse names of columns, ranges in a grid, and lists that would be repeated.
+        """Reject names of columns, ranges in a grid, and lists that would be repeated.
 
         Raises
         ------
         ValueError
             With the name of the axis.
         """
-        # The summary has these columns beside those of the axes.
+        # The summary has these columns in addition to the columns of the axes.
         columns = ("point", "status", "reason", "epochs", "attempt", "best")
         for name, axis in self.space.items():
             if name in columns or name.startswith(("validation_", "test_")):
                 raise ValueError(f"space.{name}: is a column of the summary; choose another name")
-            # A range has no end of values.
+            # A range is not a finite set of values.
             if self.kind == "grid" and not axis.options:
                 raise ValueError(f"space.{name}: a grid needs values or choices, not a range")
-            # A list of lists is no value of a key.
+            # A list of lists is not a value of a key.
             if axis.repeat and any(isinstance(value, list) for value in axis.options):
                 raise ValueError(f"space.{name}: repeat needs single values, not lists")
         return self
 
     @model_validator(mode="after")
     def check_keys(self) -> Sweep:
-        """Refuse keys that the model does not read, and keys that are set by two axes.
+        """Reject keys that the model does not read, and keys that are set by two axes.
 
         Raises
         ------
         ValueError
             With the key, and those that may be changed.
         """
-        # Keys of an axis: those of all its choices; a range has the same keys at every value.
+        # An axis has the keys of all its choices; a range has the same keys at every value.
         keys = list(self.overrides)
         for name, axis in self.space.items():
             options = axis.options or [0]
@@ -291,13 +291,13 @@ class Sweep(Group):
                 raise ValueError(
                     f"{key}: a sweep of {self.model} may change {', '.join(self.varied)}"
                 )
-            # The later axis would win without a word.
+            # The later axis would win silently.
             if keys.count(key) > 1:
                 raise ValueError(f"{key}: set more than once")
         return self
 
 
-def point_groups(model: str) -> tuple[str, ...]:
+def list_point_groups(model: str) -> tuple[str, ...]:
     """Return the groups of the configuration that a point of a model reads.
 
     Parameters
@@ -311,12 +311,12 @@ def point_groups(model: str) -> tuple[str, ...]:
         Names of the groups. A point is named by the hash of their values, so that a change of any
         other group repeats no training.
     """
-    if model in swept_networks():
+    if model in list_swept_networks():
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*list_groups(model), "evaluation")
 
 
-def sweep_names() -> list[str]:
+def list_sweeps() -> list[str]:
     """Return the names of the sweeps of the configuration folder."""
     return sorted(path.stem for path in config_dir().glob("sweep/[!_]*.yaml"))
 
@@ -324,17 +324,17 @@ def sweep_names() -> list[str]:
 def load_sweep(name: str) -> Sweep:
     """Read and check a file of `config/sweep`.
 
-    Raises
-    ------
-    ConfigError
-        If there is no such sweep, or with one line per wrong key: file, key, what is allowed.
-
     Parameters
     ----------
     name : str
         Name of the file, without its suffix.
+
+    Raises
+    ------
+    ConfigError
+        If the sweep does not exist, or with one line per wrong key: file, key, allowed values.
     """
-    if name not in (names := sweep_names()):
+    if name not in (names := list_sweeps()):
         hint = did_you_mean(name, names)
         raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(names)}{hint}")
     return load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")

@@ -20,7 +20,7 @@ class VonKarman(Group):
     """
 
     kind: Literal["von_karman"]
-    """Tells which keys follow."""
+    """Decides which keys follow."""
     # The turbulence is static: one realisation for all stars.
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     """Seed of the turbulence."""
@@ -46,7 +46,7 @@ class VonKarman(Group):
         Raises
         ------
         ValueError
-            With the strengths, and how many there must be or what their sum must be.
+            With the strengths, and their required number or sum.
         """
         # Layers are two lists of equal length in the file.
         if len(self.layer_heights_m) != len(self.layer_strengths):
@@ -64,4 +64,4 @@ class OfTelescope(Group):
     """Aberrations that are settings of the group telescope."""
 
     kind: Literal["telescope"]
-    """Tells which keys follow."""
+    """Decides which keys follow."""

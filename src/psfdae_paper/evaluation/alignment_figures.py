@@ -14,7 +14,7 @@ import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
-from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.evaluation import drawing
 
 if TYPE_CHECKING:

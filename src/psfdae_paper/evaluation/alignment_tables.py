@@ -14,7 +14,7 @@ import pandas as pd
 
 from psfdae_paper.alignment.likelihood import compute_mean_abs_error
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
-from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.evaluation.paper import read_published
 
 Row = dict[str, object]

@@ -23,7 +23,7 @@ from psfdae.base.figures import (
 )
 from psfdae.methods import method
 from psfdae.methods.interface import Method
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Panel, Style
 
@@ -95,7 +95,7 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """
     table = efficiency[efficiency.dataset == dataset]
     # The table also has posterior means, which are not methods.
-    names = [method_class.name for method_class in registered()]
+    names = [method_class.name for method_class in list_methods()]
     figure, panels = drawing.make_panels(table)
     for axes, _, rows in panels:
         # Solid lines relative to the posterior mean, dotted lines relative to the floor.

@@ -15,7 +15,7 @@ import pandas as pd
 from psfdae.base.figures import new_figure
 from psfdae.methods import method
 from psfdae.methods.interface import Method
-from psfdae_paper.configuration.methods import oracles_last
+from psfdae_paper.configuration.methods import sort_oracles_last
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -120,7 +120,7 @@ def make_method_entries(methods: set[str], paper_methods: Set[str] = frozenset()
     """Return legend entries of measured methods, each followed by the paper's open marker."""
     # Methods that are given the noise level stand last.
     entries: list[Artist] = []
-    for method_class in oracles_last(methods | paper_methods):
+    for method_class in sort_oracles_last(methods | paper_methods):
         label = method_class.look.label
         if method_class.name in methods:
             entries.append(make_entry(label, **method_line(method_class)))

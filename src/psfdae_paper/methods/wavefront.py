@@ -71,7 +71,7 @@ class Wavefront(Method):
         FitError
             If the stars are not simulated with random Seidel aberrations.
         """
-        from psfdae_paper.bounds.estimates import fresh_stars
+        from psfdae_paper.bounds.estimates import simulate_fresh_stars
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
 
@@ -81,7 +81,7 @@ class Wavefront(Method):
         if star_config.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, star_config)
-        columns = fresh_stars(config, "optics", cls.bank_stars)
+        columns = simulate_fresh_stars(config, "optics", cls.bank_stars)
         bank = {name: column.values for name, column in columns.items()}
         return cls.from_bank(bank, config, data)
 
@@ -89,13 +89,13 @@ class Wavefront(Method):
     def from_bank(
         cls, bank_columns: Mapping[str, np.ndarray], config: Config, data: TrainingSet
     ) -> Self:
-        """Make the method from the columns of a bank of stars, as `fresh_stars` draws them."""
-        from psfdae_paper.bounds.estimates import stamp_model, static_psfs
+        """Make the method from a bank, the columns of `simulate_fresh_stars`."""
+        from psfdae_paper.bounds.estimates import build_stamp_model, propagate_static_psfs
         from psfdae_paper.bounds.posterior import Bank
 
         # The model and the static PSFs belong to the same telescope as the bank.
-        bank = Bank.of(bank_columns, config.grid.points, config.framing.jitter_px)
-        return cls(bank, stamp_model(config), static_psfs(config), data)
+        bank = Bank.from_columns(bank_columns, config.grid.points, config.framing.jitter_px)
+        return cls(bank, build_stamp_model(config), propagate_static_psfs(config), data)
 
     @cached_property
     def mixture(self) -> GaussianMixture:
@@ -182,7 +182,7 @@ class Wavefront(Method):
         """Return the likelihood of photon counts at a noise level λ."""
         from psfdae_paper.bounds.posterior import Likelihood
 
-        return Likelihood.of(self.data.noise, level, self._mean_stamp)
+        return Likelihood.from_noise(self.data.noise, level, self._mean_stamp)
 
     @cached_property
     def _mean_stamp(self) -> np.ndarray:
@@ -254,9 +254,9 @@ class Wavefront(Method):
         from psfdae_paper.bounds.estimates import ENOUGH_ESS
         from psfdae_paper.bounds.posterior import (
             PosteriorSums,
-            groups_by_field,
+            group_by_field,
             merge,
-            posterior_sums,
+            sum_posterior,
         )
 
         likelihood, fields, shifts = self.likelihood(level), *self.static.shape[:2]
@@ -265,11 +265,11 @@ class Wavefront(Method):
         def weigh(stars: np.ndarray, bank_stars: np.ndarray) -> PosteriorSums:
             field = None if star_field is None else star_field[stars]
             bank = self.bank.take(bank_stars)
-            return posterior_sums(bank, noisy[stars], likelihood, star_field=field)
+            return sum_posterior(bank, noisy[stars], likelihood, star_field=field)
 
         # Stars whose field is given are compared with the bank's stars of this field
         # and of its mirror images.
-        for stars, bank_stars in groups_by_field(len(noisy), star_field, self.bank):
+        for stars, bank_stars in group_by_field(len(noisy), star_field, self.bank):
             eighth = len(bank_stars) // 8
             first_sums = weigh(stars, bank_stars[:eighth])
             sums.put(stars, first_sums)

@@ -38,14 +38,14 @@ from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
 from psfdae.stars.noise import draw_levels
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.configuration.aligners import (
+from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.estimators import (
     ESTIMATORS,
     Estimator,
     list_estimators,
-    trained_networks,
+    list_trained_networks,
 )
-from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
-from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model, read_states
 
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 NetworkFolders = make_dataclass(
     "NetworkFolders",
-    [(name, Annotated[Folder, "Folder of this network."]) for name in trained_networks()],
+    [(name, Annotated[Folder, "Folder of this network."]) for name in list_trained_networks()],
 )
 """Options of a command: the folder of each network, by its name."""
 
@@ -125,16 +125,16 @@ def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
         Names of groups, such as "cnn" and "train_original".
     """
     # Noise, and the settings of a DAE that is applied, only where some network needs them.
-    kinds = [kind] if kind else trained_networks()
+    kinds = [kind] if kind else list_trained_networks()
     noise = ["noise"] if any(ESTIMATORS[name].noisy for name in kinds) else []
-    dae = ["evaluation"] if any(ESTIMATORS[name].denoised for name in kinds) else []
+    dae = ["evaluation"] if any(ESTIMATORS[name].uses_dae for name in kinds) else []
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
 @command("paper alignment train-network", reads=network_groups)
 def train_network(
     config: Config,
-    kind: Annotated[str, click.Choice(trained_networks())],
+    kind: Annotated[str, click.Choice(list_trained_networks())],
     states: File,
     checkpoint: Checkpoint,
     out: TrainingFolder,
@@ -168,8 +168,8 @@ def train_network(
     from psfdae_paper.alignment.networks import TrainingStates, make_training
 
     # Settings and training data of this kind of network.
-    if ESTIMATORS[kind].denoised != (dae is not None):
-        behind_dae = [name for name in trained_networks() if ESTIMATORS[name].denoised]
+    if ESTIMATORS[kind].uses_dae != (dae is not None):
+        behind_dae = [name for name in list_trained_networks() if ESTIMATORS[name].uses_dae]
         raise click.UsageError(f"--dae goes with --kind {', '.join(behind_dae)}, and only with it")
     # Every network has a group train_NAME.
     settings: NetworkTrain = getattr(config, f"train_{kind}")
@@ -416,9 +416,9 @@ def estimate(
         # Each network, with the stamps that it was trained for.
         for column, method in enumerate(methods):
             start_s = time.perf_counter()
-            estimates[row, column] = predict[method.network](dae_psf if method.denoised else noisy)
+            estimates[row, column] = predict[method.network](dae_psf if method.uses_dae else noisy)
             # Seconds for all states of the set; the DAE is part of a method that uses it.
-            seconds = time.perf_counter() - start_s + denoising_seconds * method.denoised
+            seconds = time.perf_counter() - start_s + denoising_seconds * method.uses_dae
             rows.append((test_set, level, method.name, seconds, len(noisy)))
     about = f"[λ, method, state, number]; {_names(methods)}"
     columns = {"estimates": Column(estimates, "range", about)}

@@ -31,9 +31,9 @@ from psfdae_paper.alignment.telescope import (
     design_states,
     fit_quadratic,
 )
-from psfdae_paper.configuration.aligners import ESTIMATORS, Estimator, list_estimators
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.estimators import ESTIMATORS, Estimator, list_estimators
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import alignment_figures, alignment_tables
 from psfdae_paper.evaluation.paper import read_published
@@ -322,7 +322,7 @@ def time_table(
     for method in (a for a in ESTIMATORS.values() if a.network):
         seconds, states = total.loc[method.name].to_numpy()
         # The trainings of all networks that the method needs.
-        networks = [method.network, *(["dae"] if method.denoised else [])]
+        networks = [method.network, *(["dae"] if method.uses_dae else [])]
         training_seconds = sum(training[name] for name in networks)
         rows.append((method.name, seconds / states, int(states), training_seconds))
     columns = ["method", "seconds_per_state", "states", "training_seconds"]

@@ -22,9 +22,9 @@ from psfdae.base.threads import limit_threads
 from psfdae.methods import method
 from psfdae.training.star_sets import field_positions, training_set
 from psfdae_paper.bounds import tables
-from psfdae_paper.bounds.estimates import SPLIT, bounded_stars, fresh_stars
+from psfdae_paper.bounds.estimates import SPLIT, read_test_stars, simulate_fresh_stars
 from psfdae_paper.bounds.floor import Comparison
-from psfdae_paper.bounds.posterior import Bank, jittered_templates
+from psfdae_paper.bounds.posterior import Bank, cut_templates
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
@@ -59,7 +59,7 @@ def bank(config: Config, out: File) -> None:
     limit_threads(1)  # batches run in parallel
     # Two draws of the simulator, one after the other: the second has its own random streams.
     parts = [
-        fresh_stars(config, name, count, config.bounds.threads)
+        simulate_fresh_stars(config, name, count, config.bounds.threads)
         for name, count in (
             ("bank", config.bounds.bank_stars),
             ("bank_position", config.bounds.position_stars),
@@ -120,9 +120,9 @@ def bounds(
     template_product = read_product(templates, "templates", ("psf",))
     require(templates, template_product.config, STATIC, config)
     # The static PSFs with all centring errors that a star may have.
-    static = jittered_templates(template_product["psf"], config.framing.jitter_px)
+    static = cut_templates(template_product["psf"], config.framing.jitter_px)
     # All bounds of a dataset add their rows to these tables.
-    bound = tables.Tables(dataset, bounded_stars(config, product))
+    bound = tables.Tables(dataset, read_test_stars(config, product))
     # Without random aberrations a star is one of the templates, and the bound is exact.
     if config.stars.aberration_fraction == 0:
         tables.add_exact(config, static, bound)
@@ -137,7 +137,7 @@ def bounds(
         # Points along a side of the field, and the largest centring error.
         sizes = (settings["grid"]["points"], settings["framing"]["jitter_px"])
         # Only bounds for a given field use the stars after the first `bank_stars`.
-        large_bank = Bank.of(bank_product.arrays, *sizes)
+        large_bank = Bank.from_columns(bank_product.arrays, *sizes)
         count, fields = settings["bounds"]["bank_stars"], large_bank.points**2
         if count < fields:
             raise ProductError(
@@ -182,7 +182,7 @@ def optics(
     require(stars, product.config, STARS, config)
     bank_product = read_product(bank, "bank", BANK_COLUMNS)
     require(bank, bank_product.config, STARS, product.config, stars)
-    test_stars = bounded_stars(config, product)
+    test_stars = read_test_stars(config, product)
     # Field position of each bounded star, which one of the methods is given.
     position = field_positions(product)[test_stars.star]
     # Without, then with the position of the star in the field.
@@ -323,6 +323,6 @@ def paper_rows_table(bounds: File, efficiency: File, out: File) -> None:
     values = zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
     comparisons = [Comparison(*row) for row in values]
     table["paper_over_bound"] = [1 / comparison.efficiency for comparison in comparisons]
-    table["verdict"] = list(map(tables.paper_verdict, comparisons, table.tight == "yes"))
+    table["verdict"] = list(map(tables.judge_paper, comparisons, table.tight == "yes"))
     columns = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bound", "stderr"]
     write_csv(out, table[[*columns, "tight", "paper_over_bound", "verdict"]])

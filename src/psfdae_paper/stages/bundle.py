@@ -33,7 +33,7 @@ from psfdae.methods.interface import CONFIG, Method
 from psfdae.training import packing
 from psfdae.training.star_sets import fit_apart, noise_model, read_stars, training_set
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.methods import list_method_groups
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.evaluate import Models
 
@@ -147,7 +147,7 @@ def _fit_config(
     return fit_config
 
 
-@command("paper ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
+@command("paper ship", reads=(*SEEN_BY_TRAINING, *list_method_groups()))
 def ship(config: Config, bundle: tuple[File, ...], stars: File, out: Folder) -> None:
     """Make the bundle with the smallest error on validation stars the package's bundle.
 
@@ -218,7 +218,7 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
         # With the size of the bundle it has as many fine axes.
         size = sum(array.nbytes for array in bundle.weights.values())
         info = bundle.info
-        weights, _ = packing.packed(independent_fit, info.stamp_px, info.noise_min, size)
+        weights, _ = packing.pack(independent_fit, info.stamp_px, info.noise_min, size)
         bundle = replace(bundle, weights=weights)
     model, truth, noise = StarModel(bundle), data.images[data.validation], noise_model(config)
     # Flux and sky of the noisy stars are unknown to the model; the PSF of flux 1 is compared with

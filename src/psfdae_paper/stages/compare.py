@@ -22,7 +22,7 @@ from psfdae.base.reading import read_table, read_yaml
 from psfdae.methods import method
 from psfdae.methods.interface import CONFIG, HISTORY
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import SIGNIFICANT
 from psfdae_paper.evaluation.measure import CELL, read_tables
@@ -95,7 +95,7 @@ def _networks(folder: Path) -> set[Path]:
 
     A network is METHOD/DATASET/SPLIT-REFERENCE, with its configuration in it.
     """
-    names = (m.name for m in registered() if m.storage and CONFIG in m.storage.files)
+    names = (m.name for m in list_methods() if m.storage and CONFIG in m.storage.files)
     paths = (path for name in names for path in folder.glob(f"{name}/*/*/{CONFIG}"))
     return {path.parent.relative_to(folder) for path in paths}
 

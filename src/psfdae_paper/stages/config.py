@@ -45,7 +45,7 @@ def config(
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names.values()))}")
         # Groups of the stage without options; a stage may read more with some of them.
         groups = Groups(reader.names({}), reader.choice)
-        settings = load_stage(groups.names({}), groups.with_choice(overrides))
+        settings = load_stage(groups.names({}), groups.prepend_choice(overrides))
     # In the order of the classes, as in the documentation.
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
 

@@ -27,7 +27,7 @@ from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars, training_set
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
@@ -36,14 +36,14 @@ from psfdae_paper.stars.fields import square_grid
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
-    *dict.fromkeys(group for m in registered() if m.storage is None for group in m.groups),
+    *dict.fromkeys(group for m in list_methods() if m.storage is None for group in m.groups),
 )
 """Groups of the configuration on which the measurements depend, if stored models are given.
 
 Methods that store no model are fitted by the stage, and their settings are among these groups.
 """
 
-STORED = {m.name: Folder if m.storage.files else File for m in registered() if m.storage}
+STORED = {m.name: Folder if m.storage.files else File for m in list_methods() if m.storage}
 """Type of the path of each method that stores a model: its folder or file."""
 
 Models = make_dataclass(

@@ -19,7 +19,7 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import list_groups, method
 from psfdae.training.star_sets import read_stars, training_set
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.methods import list_method_groups
 from psfdae_paper.configuration.schema import Config
 
 Stars = Annotated[File, "Product of the stage stars."]
@@ -35,7 +35,7 @@ def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
     **options
         The other options of the command, which are not used.
     """
-    return list_groups(name) if name else ("seed", "noise", "parts", *all_groups())
+    return list_groups(name) if name else ("seed", "noise", "parts", *list_method_groups())
 
 
 @command("paper fit", reads=groups_read)

@@ -17,9 +17,9 @@ from psfdae.base.files import read_product, write_csv
 from psfdae.base.reading import read_table, read_yaml
 from psfdae.base.threads import limit_threads
 from psfdae.methods.interface import CONFIG, HISTORY
-from psfdae_paper.configuration.aligners import Estimator
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.estimators import Estimator
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.alignment_tables import Row, tabulate_errors
 from psfdae_paper.stages.alignment_methods import (

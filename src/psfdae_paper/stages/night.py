@@ -22,7 +22,7 @@ from psfdae.base.errors import Error
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
-from psfdae.commands.cli import refusal, typed_values
+from psfdae.commands.cli import parse_options, refusal
 from psfdae.denoise.bundle import SUFFIX
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import write_table
@@ -239,7 +239,7 @@ def bright_stars(row: Mapping[str, object]) -> ImageStars:
     from psfdae.training.from_image import collect_stars
     from psfdae.training.settings import settings_model
 
-    values = typed_values(ImageOptions, {name: str(text) for name, text in row.items()})
+    values = parse_options(ImageOptions, {name: str(text) for name, text in row.items()})
     source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in values, **values})
     return collect_stars([source], settings_model()())
 
@@ -358,12 +358,12 @@ def measure_image(
         of bright, measured and flagged stars; magnitude of the 20th brightest star in counts;
         zero point and its scatter; median χ² of the stars.
     """
-    from psfdae.photometry.image_photometry import photometry_of_image
+    from psfdae.photometry.image_photometry import measure_all_stars
     from psfdae.report.validation import validate
 
     path = folder / str(row["name"])
     reference = Path(str(row["reference"])) if row.get("reference") else None
-    photometry = photometry_of_image(
+    photometry = measure_all_stars(
         model, stars.source, reference=reference, opened=stars.observation
     )
     table = photometry.table

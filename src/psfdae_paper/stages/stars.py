@@ -137,8 +137,8 @@ def stars(config: Config, templates: File, out: File) -> None:
             # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.
-            static_psfs = static["psf"][star_field[part]].astype(np.float64)
-            jittered_psfs = crop_jittered(static_psfs, jitter[part], framing.jitter_px)
+            propagate_static_psfs = static["psf"][star_field[part]].astype(np.float64)
+            jittered_psfs = crop_jittered(propagate_static_psfs, jitter[part], framing.jitter_px)
             arrays = dict(zip(("template", "energy"), normalise_flux(jittered_psfs), strict=True))
             # The star's own image; the light inside the stamp refers to the realisation.
             if propagation is not None:

@@ -21,9 +21,9 @@ from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_json
 from psfdae.base.settings import parse_settings
 from psfdae.methods.interface import FitError
-from psfdae_paper.configuration.aligners import swept_networks
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.estimators import list_swept_networks
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value
 from psfdae_paper.sweeps.measurement import Measurement, Task
@@ -40,7 +40,7 @@ def training_module(model: str) -> str:
     model : str
         Name of a method, or of a network of scene 3.
     """
-    if model in swept_networks():
+    if model in list_swept_networks():
         return "psfdae_paper.stages.network_point"
     return "psfdae_paper.stages.method_point"
 
@@ -116,7 +116,7 @@ def sweep_point(
         raise SweepError(f"{out}: sweep {name} has no point {out.name}")
     entry = plan.points[out.name]
     # Networks of scene 3 have separate validation and test states; methods split their stars.
-    roles = {"states", "validation", "test"} if sweep.model in swept_networks() else {"stars"}
+    roles = {"states", "validation", "test"} if sweep.model in list_swept_networks() else {"stars"}
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {sweep.model} needs {', '.join(sorted(roles))}")
     # For networks of scene 3, tables have the name of the network as dataset.

@@ -23,9 +23,9 @@ from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
-    decisive_settings,
-    overrides_for,
-    stage_tree,
+    drop_neutral_settings,
+    select_overrides,
+    select_stage_groups,
     validate_tree,
 )
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -212,7 +212,7 @@ class Plan:
             "reference": self.sweep.reference,
             "levels": self.levels,
             "data": self.data_config,
-            "config": decisive_settings(config),
+            "config": drop_neutral_settings(config),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
         # 12 hexadecimal digits: among 1e5 points, two names agree by chance once in 5e4 sweeps.
@@ -230,14 +230,16 @@ class Plan:
             settings = ", ".join(f"{name}={value}" for name, value in values.items())
             point = f" (point {settings})" if values else ""
             raise SweepError(f"{path}: {str(error).splitlines()[0]}{point}") from None
-        return stage_tree(self.sweep.reads, config)
+        return select_stage_groups(self.sweep.reads, config)
 
     @cached_property
     def data_config(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
         # Axes do not change the images: all points are measured on the same.
         config = validate_tree(self.tree).model_dump()
-        return stage_tree(SIMULATION if self.sweep.dataset else Alignment.state_groups, config)
+        return select_stage_groups(
+            SIMULATION if self.sweep.dataset else Alignment.state_groups, config
+        )
 
 
 def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
@@ -258,7 +260,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     # What is varied, from the file of the sweep.
     sweep = load_sweep(name)
     # The configuration of the sweep's dataset, with those overrides that concern it.
-    tree = compose((*sweep.choice, *overrides_for(overrides, sweep.choice)))
+    tree = compose((*sweep.choice, *select_overrides(overrides, sweep.choice)))
     return Plan(name, sweep, tree)
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from psfdae_paper.configuration.aligners import ESTIMATORS
+from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.workflow.run import SCENE3, Run, dataset_config
+from psfdae_paper.workflow.run import SCENE3, Run, load_dataset_config
 
 TEST_SETS = ("uniform", "grid")
 PAPER_TABLES = {
@@ -15,9 +15,9 @@ PAPER_TABLES = {
 """Tables that the paper prints, with their titles in the report."""
 
 
-def alignment_config(run: Run) -> Config:
+def load_alignment_config(run: Run) -> Config:
     """Return the checked configuration of scene 3; a wrong key ends the program."""
-    return dataset_config(run, SCENE3)
+    return load_dataset_config(run, SCENE3)
 
 
 def training_states(run: Run, network: str) -> str:
@@ -27,8 +27,9 @@ def training_states(run: Run, network: str) -> str:
 
 def network_dae(run: Run, network: str) -> list[str]:
     """Return the weights of the DAE, if a network is trained on its output."""
+    # An empty list adds no input to the rule, which trains networks with and without the DAE.
     weights = f"{run.results}/alignment/dae/dae.safetensors"
-    return [weights] if ESTIMATORS[network].denoised else []
+    return [weights] if ESTIMATORS[network].uses_dae else []
 
 
 def network_files(run: Run, name: str, weights: str) -> dict[str, str]:
@@ -45,8 +46,9 @@ def network_files(run: Run, name: str, weights: str) -> dict[str, str]:
     """
     folder = f"{run.results}/alignment/{name}"
     files = ("config.yaml", "trained_on.yaml", "history.csv")
-    named = {file.partition(".")[0]: f"{folder}/{file}" for file in files}
-    return {"weights": f"{folder}/{weights}", **named}
+    # Outputs have the names of their files, so that a rule can address each of them.
+    paths = {file.partition(".")[0]: f"{folder}/{file}" for file in files}
+    return {"weights": f"{folder}/{weights}", **paths}
 
 
 def likelihood_network(run: Run) -> str:
@@ -56,6 +58,7 @@ def likelihood_network(run: Run) -> str:
 
 def fit_files(run: Run, *test_sets: str, ending: str = ".h5") -> list[str]:
     """Return the fits of test sets at all noise levels; their times have the ending _times.csv."""
-    levels = [f"{level:g}" for level in alignment_config(run).noise.levels]
+    # A job for each noise level: fits of single states are slow, and levels are independent.
+    levels = [f"{level:g}" for level in load_alignment_config(run).noise.levels]
     folder = f"{run.results}/alignment/fits"
     return [f"{folder}/{name}_{level}{ending}" for name in test_sets for level in levels]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psfdae_paper.workflow.run import Run, dataset_config, default_datasets
+from psfdae_paper.workflow.run import Run, list_default_datasets, load_dataset_config
 
 
 def dataset_files(run: Run, ending: str) -> list[str]:
@@ -11,17 +11,19 @@ def dataset_files(run: Run, ending: str) -> list[str]:
     The ending is ".csv" for means, "_growth.csv" for banks of several sizes, or ".parquet" for
     single stars.
     """
-    return [f"{run.results}/bounds/{dataset}{ending}" for dataset in default_datasets(run)]
+    return [f"{run.results}/bounds/{dataset}{ending}" for dataset in list_default_datasets(run)]
 
 
 def has_bank(run: Run, dataset: str) -> bool:
     """Return True if stars have random aberrations, of which a bank is drawn."""
-    return bool(dataset_config(run, dataset).stars.aberration_fraction > 0)
+    # Other stars are their templates: the sum over all of them is exact, without samples.
+    return bool(load_dataset_config(run, dataset).stars.aberration_fraction > 0)
 
 
 def bank_files(run: Run, dataset: str) -> list[str]:
     """Return the bank of simulated stars of a dataset, if it has one."""
-    stars = dataset_config(run, dataset).stars.name
+    # Datasets with the same stars differ in noise only, and share the bank.
+    stars = load_dataset_config(run, dataset).stars.name
     return [f"{run.results}/bounds/bank/{stars}.h5"] if has_bank(run, dataset) else []
 
 

@@ -10,23 +10,23 @@ from typing import Any
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.compose import dataset_names
-from psfdae_paper.configuration.consistency import simulation_changes
+from psfdae_paper.configuration.compose import list_datasets
+from psfdae_paper.configuration.consistency import compare_simulations
 from psfdae_paper.workflow.fits import bundle_files, histories, method_names
 from psfdae_paper.workflow.run import (
     SCENE3,
     Run,
     Wildcards,
     compose_choice,
-    dataset_config,
-    default_datasets,
     exit_in_one_line,
+    list_default_datasets,
+    load_dataset_config,
 )
 
 OWN_STARS = "from_stars"
-"""The dataset whose stars are those of an image, and not simulated."""
+"""The dataset whose stars come from an image instead of a simulation."""
 METRICS = ("ssim", "mse")
-TABULATED = ("dataset3", "dataset5", "dataset8")
+TABLE_DATASETS = ("dataset3", "dataset5", "dataset8")
 """The datasets that the paper tabulates; the calibration compares with their rows."""
 SHIPPED_DATASET = "field"
 """The stars and the training of the model that comes with the package."""
@@ -39,22 +39,23 @@ SCENE_HEADINGS = {
 """Headings of the report."""
 
 
-def simulated_datasets() -> list[str]:
+def list_simulated_datasets() -> list[str]:
     """Return the datasets with simulated stars."""
-    return [name for name in dataset_names() if name not in (OWN_STARS, SCENE3)]
+    return [name for name in list_datasets() if name not in (OWN_STARS, SCENE3)]
 
 
-def datasets_without(names: Iterable[str]) -> list[str]:
-    """Return the simulated datasets that are none of some rules."""
-    return sorted(set(simulated_datasets()) - set(names))
+def list_datasets_except(names: Iterable[str]) -> list[str]:
+    """Return the simulated datasets except those with these names."""
+    return sorted(set(list_simulated_datasets()) - set(names))
 
 
-def compared_methods(run: Run) -> list[str]:
-    """Return the methods of the example of an image: those of the datasets and of own stars.
+def list_compared_methods(run: Run) -> list[str]:
+    """Return the methods of the example of an image: methods of the datasets and of own stars.
 
     The command leaves out the methods that take long; here all are compared.
     """
-    datasets = (default_datasets(run)[0], OWN_STARS)
+    # One dataset is enough: all simulated ones have the same methods by default.
+    datasets = (list_default_datasets(run)[0], OWN_STARS)
     return list(dict.fromkeys(name for d in datasets for name in method_names(run, d)))
 
 
@@ -62,30 +63,32 @@ def compared_methods(run: Run) -> list[str]:
 def _owners() -> tuple[dict[str, str], dict[str, str]]:
     """Return the first dataset of each set of stars, and of each scene.
 
-    The files are read as they are, without their defaults: that takes a hundredth of the time of
-    their composition. A dataset that has the stars of another one does not name them itself.
+    The files are read without their defaults, which takes a hundredth of the time of their
+    composition. A dataset with the stars of another one does not name them itself.
     Datasets of the default target come first, so that a further one does not become the first.
     """
     stars: dict[str, str] = {}
     scenes: dict[str, str] = {}
-    usual = read_yaml(config_dir() / "config.yaml")["workflow"]["datasets"]
-    for dataset in dict.fromkeys([*usual, *simulated_datasets()]):
+    defaults = read_yaml(config_dir() / "config.yaml")["workflow"]["datasets"]
+    for dataset in dict.fromkeys([*defaults, *list_simulated_datasets()]):
+        # A dataset without a file is rejected when it is composed, with a better message.
         path = config_dir() / f"dataset/{dataset}.yaml"
         tree = read_yaml(path) if path.is_file() else {}
         if name := (tree.get("stars") or {}).get("name"):
             stars.setdefault(name, dataset)
+        # The scene is an entry of Hydra's list of defaults, such as `/scene: seidel`.
         for entry in tree.get("defaults", []):
             if isinstance(entry, dict) and "/scene" in entry:
                 scenes.setdefault(entry["/scene"], dataset)
     return stars, scenes
 
 
-def stars_names() -> list[str]:
+def list_star_sets() -> list[str]:
     """Return the names of the sets of stars that datasets share."""
     return list(_owners()[0])
 
 
-def scene_names() -> list[str]:
+def list_scenes() -> list[str]:
     """Return the names of the scenes."""
     return sorted(_owners()[1])
 
@@ -102,6 +105,7 @@ def scene_choice(scene: str) -> str:
 
 def templates_file(run: Run, stars: str) -> str:
     """Return the static PSFs from which a set of stars is made."""
+    # The override of a scene applies here, too: its name is read from the composed tree.
     tree = compose_choice(run, stars_choice(stars))
     return f"{run.results}/data/{tree['scene']['name']}/templates.h5"
 
@@ -109,10 +113,10 @@ def templates_file(run: Run, stars: str) -> str:
 @cache
 @exit_in_one_line()
 def stars_file(run: Run, dataset: str) -> str:
-    """Return the stars of a dataset: those of its `stars.name`, or of its own telescope.
+    """Return the stars of a dataset, by its `stars.name` or of its own telescope.
 
-    Datasets share the stars of a name, which are simulated by the first of them. A dataset that
-    changes a group of the simulation would get the stars of the others: it ends the program.
+    Datasets share the stars of a name, which the first of them simulates. A dataset that changes a
+    group of the simulation would get the stars of the other datasets: it ends the program.
 
     Parameters
     ----------
@@ -121,48 +125,53 @@ def stars_file(run: Run, dataset: str) -> str:
     dataset : str
         Option of the group dataset.
     """
-    config = dataset_config(run, dataset)
+    config = load_dataset_config(run, dataset)
     name = config.stars.name
     # Datasets of own telescopes have stars of their own (own_telescope.smk).
     if config.scene.name != "telescope":
         file = os.path.relpath(config_dir() / f"dataset/{dataset}.yaml")
         advice = f"stars of its own have another stars.name in {file}"
-        if name not in stars_names():
+        if name not in list_star_sets():
             raise ConfigError(
                 f"dataset={dataset}: stars.name = {name}: no dataset has these stars; {advice}"
             )
         tree, choice = compose_choice(run, f"dataset={dataset}"), stars_choice(name)
-        for key, value, simulated in simulation_changes(tree, compose_choice(run, choice)):
+        # The first difference ends the program; one is enough for the user to see the cause.
+        for key, value, star_value in compare_simulations(tree, compose_choice(run, choice)):
             raise ConfigError(
                 f"dataset={dataset}: {key} = {value}, but its stars are those of {choice} with "
-                f"{simulated}; {advice}"
+                f"{star_value}; {advice}"
             )
     return f"{run.results}/data/{config.scene.name}/{name}.h5"
 
 
 def networks(run: Run, dataset: str) -> list[tuple[str, str]]:
     """Return split and reference of each network of a dataset."""
-    chosen = dataset_config(run, dataset).dataset
-    return [(split, reference) for split in chosen.splits for reference in chosen.references]
+    group = load_dataset_config(run, dataset).dataset
+    return [
+        (split_name, reference) for split_name in group.splits for reference in group.references
+    ]
 
 
 def evaluations(run: Run, dataset: str, splits: Sequence[str] = ()) -> list[str]:
     """Return the evaluations (CSV) of a dataset, of all its splits unless some are named."""
     return [
-        f"{run.results}/evaluation/{dataset}/{split}-{reference}.csv"
-        for split, reference in networks(run, dataset)
-        if not splits or split in splits
+        f"{run.results}/evaluation/{dataset}/{split_name}-{reference}.csv"
+        for split_name, reference in networks(run, dataset)
+        if not splits or split_name in splits
     ]
 
 
 def star_errors(run: Run, dataset: str, splits: Sequence[str] = ()) -> list[str]:
     """Return the errors of the methods on single test stars (parquet), as `evaluations`."""
+    # The stage writes both files of an evaluation, with the same stem.
     files = evaluations(run, dataset, splits)
     return [csv.removesuffix(".csv") + ".parquet" for csv in files]
 
 
 def paper_tables(run: Run, dataset: str) -> list[str]:
     """Return the paper's tables of a dataset, as CSV and as Markdown."""
+    # CSV for programs, Markdown for the report and the pages.
     stems = [f"{run.results}/tables/{dataset}_{metric}" for metric in METRICS]
     return [f"{stem}.{ending}" for stem in stems for ending in ("csv", "md")]
 
@@ -173,34 +182,37 @@ def metric_options(wildcards: Wildcards, output: Any) -> list[str]:
 
 
 def shown_levels(run: Run, dataset: str) -> list[float]:
-    """Return the noise levels λ of the figure of restored stars.
+    """Return the noise levels λ of the figure of denoised stars.
 
     These are the levels `dataset.shown_levels` that the noise band has, or its extremes.
     """
-    config = dataset_config(run, dataset)
+    config = load_dataset_config(run, dataset)
     band = config.noise.levels
-    asked = [level for level in config.dataset.shown_levels if level in band]
-    return asked or sorted({min(band), max(band)})
+    # Overrides may change the band so that the levels of the figure are outside it.
+    band_levels = [level for level in config.dataset.shown_levels if level in band]
+    return band_levels or sorted({min(band), max(band)})
 
 
 def report_category(run: Run, wildcards: Wildcards) -> str:
     """Return the heading of a figure in the report: its scene."""
+    # Figures of templates belong to a scene, all others to a dataset: rules have either wildcard.
     experiment: str
     if "scene" in wildcards.keys():  # type: ignore[operator]  # noqa: SIM118 (a named list)
         experiment = compose_choice(run, scene_choice(wildcards.scene))["scene"]["experiment"]
     else:
-        experiment = dataset_config(run, wildcards.dataset).scene.experiment
+        experiment = load_dataset_config(run, wildcards.dataset).scene.experiment
     return SCENE_HEADINGS.get(experiment, experiment)
 
 
 def has_own_telescope(run: Run, dataset: str) -> bool:
     """Return True if a dataset has a telescope with aberrations of its own."""
-    return bool(dataset_config(run, dataset).scene.name == "telescope")
+    return bool(load_dataset_config(run, dataset).scene.name == "telescope")
 
 
 def figures(run: Run, dataset: str) -> list[str]:
     """Return the figures of a dataset and of its scene, or of its own telescope."""
-    config, folder = dataset_config(run, dataset), f"{run.results}/figures"
+    config, folder = load_dataset_config(run, dataset), f"{run.results}/figures"
+    # Own telescopes are not in the paper: one figure of their field replaces two of the scene.
     if has_own_telescope(run, dataset):
         fields = [f"telescope/{config.stars.name}"]
     else:
@@ -215,6 +227,7 @@ def figures(run: Run, dataset: str) -> list[str]:
 
 def products(run: Run, dataset: str) -> list[str]:
     """Return all files that the target of a dataset builds."""
+    # Models of own telescopes are for use on images; models of the paper are packed on request.
     has_bundles = has_own_telescope(run, dataset)
     return [
         *(bundle_files(run, dataset, networks(run, dataset)) if has_bundles else []),
@@ -226,10 +239,10 @@ def products(run: Run, dataset: str) -> list[str]:
 
 
 def default_products(run: Run, experiment: str = "") -> list[str]:
-    """Return all files of the datasets of the default target, or of those of one scene."""
+    """Return all files of the datasets of the default target, or of one scene among them."""
     return [
         file
-        for dataset in default_datasets(run)
-        if not experiment or dataset_config(run, dataset).scene.experiment == experiment
+        for dataset in list_default_datasets(run)
+        if not experiment or load_dataset_config(run, dataset).scene.experiment == experiment
         for file in products(run, dataset)
     ]

@@ -7,14 +7,14 @@ from typing import Any
 
 from psfdae.methods import fit_files, method
 from psfdae.methods.interface import HISTORY, Method
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.source import source_hash
 from psfdae_paper.workflow.run import (
     BUNDLE_SUFFIX,
     Run,
     Wildcards,
-    code_of,
-    dataset_config,
+    hash_code,
+    load_dataset_config,
     settings,
 )
 
@@ -23,22 +23,23 @@ WILDCARDS = ("{dataset}", "{split}", "{reference}")
 
 def method_names(run: Run, dataset: str) -> list[str]:
     """Return the names of a dataset's methods, in the order of tables."""
-    names: list[str] = dataset_config(run, dataset).methods
+    names: list[str] = load_dataset_config(run, dataset).methods
     return names
 
 
-def stored_methods(run: Run, dataset: str) -> list[type[Method]]:
+def list_stored_methods(run: Run, dataset: str) -> list[type[Method]]:
     """Return the methods of a dataset whose fit leaves files."""
     return [m for m in map(method, method_names(run, dataset)) if m.storage]
 
 
-def fit_place(run: Run, name: str, dataset: str, split: str, reference: str) -> str:
+def fit_place(run: Run, name: str, dataset: str, split_name: str, reference: str) -> str:
     """Return the folder or file of a fit."""
-    return f"{run.results}/{fit_files.get_fit_path(method(name), dataset, split, reference)}"
+    return f"{run.results}/{fit_files.get_fit_path(method(name), dataset, split_name, reference)}"
 
 
 def fit_outputs(run: Run, name: str, *key: str) -> list[str]:
     """Return all files of a fit of a dataset, split and reference; by default with wildcards."""
+    # With wildcards these are the outputs of a rule, with a key the inputs of a job.
     place = fit_place(run, name, *(key or WILDCARDS))
     return [str(path) for path in fit_files.outputs(method(name), place)]
 
@@ -48,26 +49,27 @@ def fit_option(run: Run, name: str, *key: str) -> str:
     return f"--{name.replace('_', '-')}={fit_place(run, name, *key)}"
 
 
-def fitted_files(run: Run, *key: str) -> list[str]:
-    """Return the files of all fits of a dataset that restore stars of a split and reference."""
-    return [p for m in stored_methods(run, key[0]) for p in fit_outputs(run, m.name, *key)]
+def list_fit_files(run: Run, *key: str) -> list[str]:
+    """Return the files of all fits of a dataset that denoise stars of a split and reference."""
+    return [p for m in list_stored_methods(run, key[0]) for p in fit_outputs(run, m.name, *key)]
 
 
 def fit_options(run: Run, *key: str) -> list[str]:
     """Return the options of a command that takes these fits."""
-    return [fit_option(run, m.name, *key) for m in stored_methods(run, key[0])]
+    return [fit_option(run, m.name, *key) for m in list_stored_methods(run, key[0])]
 
 
 def start_files(run: Run, name: str) -> Callable[[Wildcards], dict[str, list[str]]]:
     """Return an input: the fit to the realisations from which the fit to the templates starts.
 
-    It is empty for fits to the realisations, and where the settings make no fit start there.
+    It is empty for fits to the realisations, and where the settings let fits start from scratch.
     """
 
     def start(wildcards: Wildcards) -> dict[str, list[str]]:
+        # Rules of fits that do not depend on the reference lack this wildcard.
         if wildcards.get("reference") != "template":
             return {}
-        if not method(name).continues(dataset_config(run, wildcards.dataset)):
+        if not method(name).continues(load_dataset_config(run, wildcards.dataset)):
             return {}
         key = (wildcards.dataset, wildcards.split, "realisation")
         return {"start": fit_outputs(run, name, *key)}
@@ -91,14 +93,17 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
     name : str
         Name of the method.
     """
+    # The checkpoint is named like the fit, so that fits at the same time do not share one.
     stem = fit_files.stem(method(name), *WILDCARDS)
 
+    # A function, so that settings are composed when the job is planned, not when rules are read.
     def config(wildcards: Wildcards) -> str:
         return settings(run, "fit", f"dataset={wildcards.dataset}", name=name)
 
     def more(wildcards: Wildcards, input: Any) -> list[str]:
         reference = wildcards.get("reference")
         options = [f"--reference={reference}"] if reference else []
+        # `start_files` gives this input to fits to templates only.
         if input.get("start"):
             key = (wildcards.dataset, wildcards.split, "realisation")
             options.append(f"--start={fit_place(run, name, *key)}")
@@ -106,7 +111,7 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
 
     return {
         "config": config,
-        "source": code_of("fit", method(name).__module__),
+        "source": hash_code("fit", method(name).__module__),
         "method": name,
         "more": more,
         "place": fit_place(run, name, *WILDCARDS),
@@ -117,29 +122,31 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
 
 def fit_resources(name: str) -> dict[str, int]:
     """Return memory in MB and time in minutes of a fit."""
+    # A scheduler of a cluster reserves these, and ends jobs that exceed them.
     needs = method(name).needs
     return {"mem_mb": needs.memory_mb, "runtime": needs.minutes}
 
 
 def fit_threads(run: Run, name: str) -> Callable[[Wildcards], int]:
     """Return the number of threads of a fit, as a function of wildcards."""
-    return lambda wildcards: method(name).threads(dataset_config(run, wildcards.dataset))
+    return lambda wildcards: method(name).threads(load_dataset_config(run, wildcards.dataset))
 
 
 def most_threads(run: Run, dataset: str) -> int:
     """Return the largest number of threads of the fits of a dataset's methods."""
-    config = dataset_config(run, dataset)
-    return max([m.threads(config) for m in stored_methods(run, dataset)], default=1)
+    # One job fits all methods here, one after the other.
+    config = load_dataset_config(run, dataset)
+    return max([m.threads(config) for m in list_stored_methods(run, dataset)], default=1)
 
 
-def rules_without(names: Iterable[str]) -> dict[str, str]:
-    """Return rule and name of the methods that store a fit and have none of these rules.
+def list_new_rules(names: Iterable[str]) -> dict[str, str]:
+    """Return rule and name of the methods that store a fit and lack a rule among these.
 
     These are methods of other packages: the rules of our own are written out.
     """
-    known = set(names)
-    found = {fit_files.get_rule_name(m): m.name for m in registered() if m.storage}
-    return {rule: name for rule, name in found.items() if rule not in known}
+    own_rules = set(names)
+    methods_by_rule = {fit_files.get_rule_name(m): m.name for m in list_methods() if m.storage}
+    return {rule: name for rule, name in methods_by_rule.items() if rule not in own_rules}
 
 
 # Bundles.
@@ -147,21 +154,23 @@ def rules_without(names: Iterable[str]) -> dict[str, str]:
 
 def bundle_suffixes() -> dict[str, str]:
     """Return the names of the methods that can be packed, by the ending of their bundles."""
-    return {fit_files.get_bundle_suffix(m): m.name for m in registered() if m.storage and m.packing}
+    return {
+        fit_files.get_bundle_suffix(m): m.name for m in list_methods() if m.storage and m.packing
+    }
 
 
-def bundle_file(run: Run, dataset: str, split: str, reference: str, suffix: str) -> str:
-    """Return the bundle of a fit; the suffix is that of its method."""
-    return f"{run.results}/bundles/{dataset}-{split}-{reference}{suffix}{BUNDLE_SUFFIX}"
+def bundle_file(run: Run, dataset: str, split_name: str, reference: str, suffix: str) -> str:
+    """Return the bundle of a fit; each method has its own suffix."""
+    return f"{run.results}/bundles/{dataset}-{split_name}-{reference}{suffix}{BUNDLE_SUFFIX}"
 
 
 def bundle_files(run: Run, dataset: str, networks: Iterable[tuple[str, str]]) -> list[str]:
     """Return the bundles of a dataset's methods for some pairs of split and reference."""
     return [
-        bundle_file(run, dataset, split, reference, fit_files.get_bundle_suffix(m))
-        for m in stored_methods(run, dataset)
+        bundle_file(run, dataset, split_name, reference, fit_files.get_bundle_suffix(m))
+        for m in list_stored_methods(run, dataset)
         if m.packing
-        for split, reference in networks
+        for split_name, reference in networks
     ]
 
 
@@ -170,28 +179,29 @@ def bundle_memory(suffix: str) -> int:
     return max(1500, fit_resources(bundle_suffixes()[suffix])["mem_mb"])
 
 
-def packed_method(wildcards: Wildcards) -> str:
+def get_bundle_method(wildcards: Wildcards) -> str:
     """Return the method of a bundle, whose name ends in the wildcard `suffix`."""
     return bundle_suffixes()[wildcards.suffix]
 
 
-def packed_files(run: Run, wildcards: Wildcards) -> list[str]:
+def list_bundle_inputs(run: Run, wildcards: Wildcards) -> list[str]:
     """Return the files of the fit that a bundle packs."""
     key = (wildcards.dataset, wildcards.split, wildcards.reference)
-    return fit_outputs(run, packed_method(wildcards), *key)
+    return fit_outputs(run, get_bundle_method(wildcards), *key)
 
 
-def packed_option(run: Run, wildcards: Wildcards) -> str:
+def get_bundle_option(run: Run, wildcards: Wildcards) -> str:
     """Return the option of a command that takes this fit."""
     key = (wildcards.dataset, wildcards.split, wildcards.reference)
-    return fit_option(run, packed_method(wildcards), *key)
+    return fit_option(run, get_bundle_method(wildcards), *key)
 
 
 def seed_fits(run: Run, wildcards: Wildcards) -> list[str]:
-    """Return the fits of a method with the usual seed; none of a method that stores no fit."""
+    """Return the fits of a method with the default seed; empty if the method stores no fit."""
     if method(wildcards.method).storage is None:
         return []
-    references = dataset_config(run, wildcards.dataset).dataset.references
+    # Other seeds are compared with the default seed on the random split only.
+    references = load_dataset_config(run, wildcards.dataset).dataset.references
     return [
         file
         for reference in references
@@ -214,16 +224,24 @@ def methods_code(command: str, names: Iterable[str]) -> str:
 
 def histories(run: Run, dataset: str) -> dict[str, str]:
     """Return the tables with the courses of a dataset's trainings, each with its label."""
-    chosen = dataset_config(run, dataset).dataset
-    trained = [
-        m for m in stored_methods(run, dataset) if HISTORY in fit_files.get_storage(m).diagnostics
+    # Not every method leaves a table with the course of its training.
+    group = load_dataset_config(run, dataset).dataset
+    trainings = [
+        m
+        for m in list_stored_methods(run, dataset)
+        if HISTORY in fit_files.get_storage(m).diagnostics
     ]
     labels = {}
-    for m in trained:
-        for split in chosen.splits:
-            for reference in chosen.references:
-                place = fit_place(run, m.name, dataset, split, reference)
+    for m in trainings:
+        for split_name in group.splits:
+            for reference in group.references:
+                place = fit_place(run, m.name, dataset, split_name, reference)
                 # The method's label distinguishes courses of several methods.
-                words = [dataset, split, reference, *([m.look.label] if len(trained) > 1 else [])]
+                words = [
+                    dataset,
+                    split_name,
+                    reference,
+                    *([m.look.label] if len(trainings) > 1 else []),
+                ]
                 labels[str(fit_files.path_beside(m, place, HISTORY))] = ", ".join(words)
     return labels

@@ -17,7 +17,7 @@ IMAGES_PER_JOB = 10
 
 @cache
 @exit_in_one_line()
-def night_parts(run: Run) -> list[list[dict[str, str]]]:
+def split_night(run: Run) -> list[list[dict[str, str]]]:
     """Return the rows of the list of images, in one list for each job."""
     if not run.images:
         raise ConfigError("night: --config images='night/*.fits', or a CSV list of images")
@@ -40,7 +40,7 @@ def rows_file(run: Run, part: str) -> str:
 
     Its name is a hash of the rows: another name repeats the job.
     """
-    text = as_csv(night_parts(run)[int(part)])
+    text = as_csv(split_night(run)[int(part)])
     name = hashlib.sha256(text.encode()).hexdigest()[:16]
     path = Path(run.results, "night", ".rows", f"{name}.csv")
     if not (run.is_dry() or path.is_file()):
@@ -51,11 +51,11 @@ def rows_file(run: Run, part: str) -> str:
 def image_files(run: Run, part: str) -> list[str]:
     """Return the files of the images of a job; a missing file is a row with a reason."""
     columns = ("image", "catalogue", "mask", "reference", "telescope_file")
-    files = [row.get(c) for row in night_parts(run)[int(part)] for c in columns]
+    files = [row.get(c) for row in split_night(run)[int(part)] for c in columns]
     return [file for file in dict.fromkeys(files) if file and os.path.isfile(file)]  # noqa: PTH113
 
 
 def part_tables(run: Run) -> list[str]:
     """Return the tables of all parts."""
     folder = f"{run.results}/night/rows"
-    return [f"{folder}/{part}.csv" for part in range(len(night_parts(run)))]
+    return [f"{folder}/{part}.csv" for part in range(len(split_night(run)))]

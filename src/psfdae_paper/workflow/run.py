@@ -21,7 +21,7 @@ from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Group, Name, parse_settings
 from psfdae.commands.cli import stage
-from psfdae_paper.configuration.compose import compose, load, overrides_for, part, write_settings
+from psfdae_paper.configuration.compose import compose, load, part, select_overrides, write_settings
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.source import SOURCES, source_hash
 
@@ -60,7 +60,7 @@ class Wildcards(Protocol):
     def __getattr__(self, name: str) -> str: ...
 
     def get(self, name: str, default: str = "") -> str:
-        """Return a wildcard, or a default where the rule has none of this name."""
+        """Return a wildcard, or a default where the rule lacks this name."""
         ...
 
 
@@ -111,7 +111,7 @@ def exit_in_one_line(prefix: str = "") -> Iterator[None]:
 
 @exit_in_one_line()
 def require_own_package(workflow_folder: str | Path) -> None:
-    """End the program if the package is that of another clone than the rules.
+    """End the program if package and rules belong to different clones.
 
     An environment is linked to the clone that made it. In a second clone, code and configuration
     of the first one would run.
@@ -122,7 +122,7 @@ def require_own_package(workflow_folder: str | Path) -> None:
         Folder of the Snakefile.
     """
     root, folder = SOURCES.parent, Path(workflow_folder).resolve()
-    # An installed package has no rules beside it.
+    # An installed package comes without the rules.
     if (root / "workflow/Snakefile").is_file() and (root / "workflow").resolve() != folder:
         raise ConfigError(
             f"rules of {folder.parent}, but the package of {root}: run `make env` in "
@@ -134,8 +134,8 @@ def require_own_package(workflow_folder: str | Path) -> None:
 def read_run(words: Mapping[str, Any], is_dry: Callable[[], bool] = bool) -> Run:
     """Return the run that a command line describes; end the program if a word is wrong.
 
-    Preset and overrides that are not given are those of the finished run in the folder, so that a
-    further target of it needs nothing but the folder's name.
+    Preset and overrides that are not given are taken from the finished run in the folder, so that
+    the folder's name is enough for a further target of this run.
 
     Parameters
     ----------
@@ -144,17 +144,20 @@ def read_run(words: Mapping[str, Any], is_dry: Callable[[], bool] = bool) -> Run
     is_dry : callable
         See `Run`.
     """
-    given = {key: value for key, value in words.items() if value}
-    known = list(CommandLine.model_fields)
-    for word in set(given) - set(known):
-        hint = did_you_mean(word, known)
-        raise ConfigError(f"--config {word}: there are {', '.join(known)}{hint}")
-    finished = read_finished_run(str(given["results"])) if "results" in given else {}
-    line = parse_settings(CommandLine, {**finished, **given})
+    # An empty word, such as sweep=, means the default.
+    options = {key: value for key, value in words.items() if value}
+    option_names = list(CommandLine.model_fields)
+    for word in set(options) - set(option_names):
+        hint = did_you_mean(word, option_names)
+        raise ConfigError(f"--config {word}: there are {', '.join(option_names)}{hint}")
+    earlier_run = read_finished_run(str(options["results"])) if "results" in options else {}
+    line = parse_settings(CommandLine, {**earlier_run, **options})
+    # As in a shell, so that an override may contain quoted spaces.
     try:
         overrides = (f"preset={line.preset}", *shlex.split(line.set))
     except ValueError as error:
         raise ConfigError(f"set = {line.set!r}: {error}") from None
+    # Presets have separate folders, so that a quick run never replaces a long one.
     default_folder = "results" if line.preset == "fast" else f"results/{line.preset}"
     return Run(
         line.preset,
@@ -182,7 +185,7 @@ def read_finished_run(folder: str) -> dict[str, str]:
         if not isinstance(tree, dict):
             raise ConfigError(f"{record}: must be a mapping")
         return tree
-    # Whole runs of earlier versions have no record.
+    # Complete runs of earlier versions lack the record.
     return {"set": ""} if Path(folder, "runtime.csv").is_file() else {}
 
 
@@ -197,14 +200,17 @@ def require_same_run(run: Run) -> None:
     run : Run
         Run that is about to start.
     """
-    finished = read_finished_run(run.results)
-    if run.is_folder_named or run.sweep or run.images or not finished:
+    earlier_run = read_finished_run(run.results)
+    if run.is_folder_named or run.sweep or run.images or not earlier_run:
         return
-    finished_words, words = shlex.split(finished.get("set") or ""), run.overrides[1:]
-    lost = " ".join(word for word in finished_words if word not in words)
-    added = " ".join(word for word in words if word not in finished_words)
-    if lost or added:
-        differences = [f"with {lost}"] * bool(lost) + [f"without {added}"] * bool(added)
+    # The first override is the preset, which decides the default folder already.
+    earlier_words, words = shlex.split(earlier_run.get("set") or ""), run.overrides[1:]
+    missing = " ".join(word for word in earlier_words if word not in words)
+    additional = " ".join(word for word in words if word not in earlier_words)
+    if missing or additional:
+        differences = [f"with {missing}"] * bool(missing) + [f"without {additional}"] * bool(
+            additional
+        )
         purpose = "to replace it" if words else "to go on with it"
         raise ConfigError(
             f"{run.results} holds a finished run {' and '.join(differences)}; name a folder for "
@@ -215,6 +221,7 @@ def require_same_run(run: Run) -> None:
 
 def record_run(run: Run) -> None:
     """Write preset and overrides of a finished run into its folder."""
+    # Sweeps and nights add to a folder without changing the run in it.
     if not (run.sweep or run.images):
         record = {"preset": run.preset, "set": shlex.join(run.overrides[1:])}
         write_text(Path(run.results, "run.yaml"), as_yaml(record))
@@ -223,7 +230,7 @@ def record_run(run: Run) -> None:
 def close_target(words: Sequence[str], targets: Sequence[str]) -> str:
     """Return a line that names the target which a mistyped word resembles; empty if none does.
 
-    Snakemake takes a mistyped target for a file that no rule makes. Values of options, such as
+    Snakemake treats a mistyped target as a file without a rule. Values of options, such as
     mtime, resemble no target as much as a typing error does.
 
     Parameters
@@ -234,6 +241,7 @@ def close_target(words: Sequence[str], targets: Sequence[str]) -> str:
         Names of all rules.
     """
     for word in words:
+        # Paths and options are not identifiers; a file of this name is a valid target.
         if word.isidentifier() and word not in targets and not Path(word).exists():
             for name in get_close_matches(word, targets, n=1, cutoff=0.8):
                 return f"psfdae: no target {word}; did you mean {name}?"
@@ -244,32 +252,33 @@ def close_target(words: Sequence[str], targets: Sequence[str]) -> str:
 
 
 @exit_in_one_line()
-def compose_choice(run: Run, *choice: str, more: tuple[str, ...] = ()) -> dict[str, Any]:
+def compose_choice(run: Run, *choice: str, extra: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the configuration of a choice with the run's overrides that concern it, unchecked.
 
     Parameters
     ----------
     run : Run
-        Its overrides are selected by `overrides_for`.
+        Its overrides are selected by `select_overrides`.
     *choice : str
         Such as dataset=dataset3.
-    more : tuple of str
+    extra : tuple of str
         Further overrides of one job.
     """
-    return compose((*choice, *overrides_for(run.overrides, choice), *more))
+    return compose((*choice, *select_overrides(run.overrides, choice), *extra))
 
 
 @cache
-def dataset_config(run: Run, dataset: str) -> Config:
+def load_dataset_config(run: Run, dataset: str) -> Config:
     """Return the checked configuration of a dataset; a wrong key ends the program."""
+    # The message begins with the dataset, as one command may build several.
     choice = f"dataset={dataset}"
     with exit_in_one_line(f"{choice}: "):
-        return load((choice, *overrides_for(run.overrides, (choice,))))
+        return load((choice, *select_overrides(run.overrides, (choice,))))
 
 
 @cache
 @exit_in_one_line()
-def default_datasets(run: Run) -> list[str]:
+def list_default_datasets(run: Run) -> list[str]:
     """Return the datasets that are built if the command line names none.
 
     Sizes that fit together in one dataset may not in another: they are checked where one is built.
@@ -286,7 +295,7 @@ def default_datasets(run: Run) -> list[str]:
 @cache
 @exit_in_one_line()
 def settings(
-    run: Run, name: str, /, *choice: str, more: tuple[str, ...] = (), **options: str
+    run: Run, name: str, /, *choice: str, extra: tuple[str, ...] = (), **options: str
 ) -> str:
     """Return the file with the settings that a stage reads, and write it unless the run is dry.
 
@@ -300,23 +309,25 @@ def settings(
         Command, or module and function of a program in `BENCHMARKS`, such as "costs.cost".
     *choice : str
         Such as dataset=dataset3.
-    more : tuple of str
+    extra : tuple of str
         Further overrides.
     **options : str
         Options of the command on which its groups of settings depend.
     """
+    # Programs of the benchmarks are not commands of the package, but declare settings alike.
     program, _, function = name.rpartition(".")
     command: Any = getattr(import_benchmark(program), function) if program else stage(name)
     reader = command.stage.settings
-    tree = compose_choice(run, *reader.choice, *choice, more=more)
+    tree = compose_choice(run, *reader.choice, *choice, extra=extra)
     return write_groups(run, name, reader.names(options), tree)
 
 
 def write_groups(run: Run, name: str, groups: tuple[str, ...], tree: Mapping[str, Any]) -> str:
     """Write groups of a configuration for a job; return the file's name.
 
-    Snakemake records no parameters that are paths, hence a text.
+    Snakemake does not record parameters that are paths, hence a text.
     """
+    # Hidden, as these files are inputs of jobs and not results.
     folder = Path(run.results, ".settings")
     return str(write_settings(folder, name, groups, tree, dry=run.is_dry()))
 
@@ -324,21 +335,22 @@ def write_groups(run: Run, name: str, groups: tuple[str, ...], tree: Mapping[str
 def import_benchmark(name: str) -> Any:
     """Return the module of a program in `BENCHMARKS`."""
     folder = os.path.abspath(BENCHMARKS)  # noqa: PTH100 (keeps symbolic links)
+    # The programs are not part of the package; each may import the others.
     if folder not in sys.path:
         sys.path.append(folder)
     return import_module(name)
 
 
-def code_of(*names: str) -> Callable[[Wildcards], str]:
+def hash_code(*names: str) -> Callable[[Wildcards], str]:
     """Return a parameter with the hash of commands and modules, computed where a job needs it."""
     return lambda wildcards: source_hash(*names)
 
 
-def program_of(name: str) -> Callable[[Wildcards, int], str]:
+def locate_program(name: str) -> Callable[[Wildcards, int], str]:
     """Return a parameter with the file and the command of a program, such as "costs.cost".
 
-    It asks for threads because such parameters are not recorded: a run in another folder, with
-    another relative path, repeats no job.
+    It depends on threads because Snakemake does not record such parameters: a run in another
+    folder, with another relative path, does not repeat the job.
     """
     file, command = name.split(".")
     return lambda wildcards, threads: f"{BENCHMARKS}/{file}.py {command}"
@@ -349,7 +361,7 @@ def program_code(name: str, *stages: str) -> str:
     return source_hash(f"workflow/benchmarks/{name.partition('.')[0]}.py", *stages)
 
 
-def program_code_of(name: str, *stages: str) -> Callable[[Wildcards], str]:
+def hash_program(name: str, *stages: str) -> Callable[[Wildcards], str]:
     """Return a parameter with the hash of `program_code`, computed where a job needs it."""
     return lambda wildcards: program_code(name, *stages)
 
@@ -364,6 +376,7 @@ def as_options(wildcards: Wildcards, input: Any) -> list[str]:
 
     The weights of a network stand for its folder; bundles have the same ending, and are files.
     """
+    # A named input is a path or a list of paths.
     options = []
     for name, files in input.items():
         for path in [files] if isinstance(files, str) else files:
@@ -373,6 +386,6 @@ def as_options(wildcards: Wildcards, input: Any) -> list[str]:
     return options
 
 
-def any_of(names: Sequence[str]) -> str:
-    """Return the pattern of a wildcard that is one of some names; "none" if there are none."""
+def match_any(names: Sequence[str]) -> str:
+    """Return the pattern of a wildcard that is one of these names; "none" for an empty list."""
     return "|".join(names) or "none"

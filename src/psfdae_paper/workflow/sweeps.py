@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache
 
 from psfdae.methods import method
-from psfdae_paper.configuration.aligners import swept_networks
-from psfdae_paper.configuration.sweep import sweep_names
+from psfdae_paper.configuration.estimators import list_swept_networks
+from psfdae_paper.configuration.sweep import list_sweeps
 from psfdae_paper.source import source_hash
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
 from psfdae_paper.workflow.datasets import stars_file
@@ -19,6 +19,7 @@ FIGURES = ("parallel", "response")
 @exit_in_one_line()
 def sweep_plan(run: Run, name: str) -> Plan:
     """Return the points of a sweep; a wrong key ends the program."""
+    # Composing all points is slow, and several rules need them: the plan is cached.
     plan = plan_sweep(name, run.overrides)
     # Points are computed once, and checked here.
     assert plan.points
@@ -28,6 +29,7 @@ def sweep_plan(run: Run, name: str) -> Plan:
 @exit_in_one_line()
 def sweep_point(run: Run, wildcards: Wildcards) -> Point:
     """Return the point of a job; a name that the sweep does not have ends the program."""
+    # The name of a point is a hash of its settings: an edited sweep no longer has it.
     points = sweep_plan(run, wildcards.sweep).points
     if wildcards.point not in points:
         raise SweepError(f"sweep {wildcards.sweep} has no point {wildcards.point}")
@@ -42,6 +44,7 @@ def result_file(run: Run, sweep: str, point: str) -> str:
 def sweep_data(run: Run, name: str) -> dict[str, str]:
     """Return the products that all points of a sweep share, by role."""
     sweep = sweep_plan(run, name).sweep
+    # Networks of scene 3 train on states, all other models on stars of a dataset.
     if sweep.dataset:
         return {"stars": stars_file(run, sweep.dataset)}
     folder = f"{run.results}/data/alignment"
@@ -61,6 +64,7 @@ def known_results(run: Run, wildcards: Wildcards) -> list[str]:
 def point_threads(run: Run, wildcards: Wildcards) -> int:
     """Return the threads of a point: the largest number of its groups of settings."""
     config = sweep_point(run, wildcards).config
+    # Threads are a setting of several groups, such as the training and the evaluation.
     groups = [group for group in config.values() if isinstance(group, dict)]
     return max(int(group.get("threads", 1)) for group in groups)
 
@@ -71,9 +75,10 @@ def sweep_code(run: Run, name: str) -> str:
     from psfdae_paper.stages.sweep import training_module
 
     sweep = sweep_plan(run, name).sweep
+    # Only adaptive values depend on the code of the search.
     search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
-    own = [] if sweep.model in swept_networks() else [method(sweep.model).__module__]
-    return source_hash("sweep point", training_module(sweep.model), *own, *search)
+    modules = [] if sweep.model in list_swept_networks() else [method(sweep.model).__module__]
+    return source_hash("sweep point", training_module(sweep.model), *modules, *search)
 
 
 def sweep_results(run: Run, name: str) -> list[str]:
@@ -86,8 +91,8 @@ def sweep_products(run: Run) -> list[str]:
     """Return all files that the target sweep builds."""
     name = run.sweep
     if not name:
-        there = ", ".join(sweep_names())
-        raise SweepError(f"which sweep? --config sweep=NAME, one of {there}")
+        names = ", ".join(list_sweeps())
+        raise SweepError(f"which sweep? --config sweep=NAME, one of {names}")
     sweep_plan(run, name)
     folder = f"{run.results}/sweeps/{name}"
     return [

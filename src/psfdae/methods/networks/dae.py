@@ -18,6 +18,7 @@ from torch.nn.grad import conv2d_weight
 
 from psfdae.base.rng import stream
 from psfdae.methods.interface import TrainingSet
+from psfdae.methods.networks.settings import image_scale
 from psfdae.methods.networks.training import (
     Adam,
     DeadNetworkError,
@@ -278,14 +279,6 @@ def fit_last_layer(
     # The last number of the solution belongs to the 1 of every row: it is the bias.
     last_weight.copy_(solution[:-1].view_as(last_weight))
     bias.copy_(solution[-1:])
-
-
-def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
-    """Return the factor from images of sum 1 to inputs of the network.
-
-    "mean" is d² for stamps of d × d pixels, which makes their mean 1; "none" is 1.
-    """
-    return float(stamp_px**2) if scale == "mean" else 1.0
 
 
 def middle_px(stamp_px: int, part: float, reference: str) -> int:

@@ -77,3 +77,11 @@ class Train(Group):
     epochs as for realisations, with new initial weights."""
     patience: Annotated[int, Field(ge=0)] = 0
     """Stop after this many validations without a better one; 0 never stops."""
+
+
+def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
+    """Return the factor from images of sum 1 to inputs of the network.
+
+    "mean" is d² for stamps of d × d pixels, which makes their mean 1; "none" is 1.
+    """
+    return float(stamp_px**2) if scale == "mean" else 1.0

@@ -9,12 +9,12 @@ from importlib import resources
 
 import pandas as pd
 
-from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.methods import list_methods
 
 
 def read_paper_names() -> dict[str, str]:
     """Return the names of our methods by their names in the paper's tables."""
-    return {m.look.paper[0]: m.name for m in registered() if m.look.paper}
+    return {m.look.paper[0]: m.name for m in list_methods() if m.look.paper}
 
 
 def read_published(table: str) -> pd.DataFrame:
@@ -41,7 +41,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         addition to the image follow its label in brackets; for the paper they are unknown.
     """
     # Measured errors of the methods that the paper has, on test stars of all fields.
-    labels = {m.name: m.look.paper[1] for m in registered() if m.look.paper}
+    labels = {m.name: m.look.paper[1] for m in list_methods() if m.look.paper}
     measured_rows = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
@@ -62,7 +62,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     )
     table = table.reset_index().drop(columns="order")
     # Labels of the methods, with their inputs; columns of noise levels as text.
-    inputs = table["method"].map({m.name: str(m.needs) for m in registered()})
+    inputs = table["method"].map({m.name: str(m.needs) for m in list_methods()})
     table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
     table.columns = [f"{c:g}" if isinstance(c, float) else c for c in table.columns]
     return table

@@ -1,6 +1,6 @@
 """The methods of scene 3, in the order of its tables.
 
-One entry says what a method estimates states from; products, rules, tables and figures follow it.
+An entry describes the input of a method; products, rules, tables and figures follow from it.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ class Estimator:
     look : Look
         Label, colour and marker in figures.
     short : str
-        Title of small panels; empty if it has none.
+        Title of small panels; empty without one.
     states : str
-        Set of states that the network of this name is trained on; empty if there is no network.
+        Set of states that the network of this name is trained on; empty without a network.
     noisy : bool
         The network is trained on noisy stamps.
-    denoised : bool
+    uses_dae : bool
         The input of the network is the output of the DAE.
     borrowed_network : str
         Method whose network this one uses: to estimate, or to start a fit.
     product : str
         Product with the results of the method, without "alignment_": estimates of networks, fits of
-        single states by maximum likelihood, or bounds; empty if they are in none.
+        single states by maximum likelihood, or bounds; empty if they are not in a product.
     unknown_flux : bool
         Flux and position of the stars in their stamps are not given.
     swept : tuple of str
@@ -52,7 +52,7 @@ class Estimator:
     short: str = ""
     states: Literal["", "grid", "train"] = ""
     noisy: bool = False
-    denoised: bool = False
+    uses_dae: bool = False
     borrowed_network: str = ""
     product: Literal["", "estimates", "fit", "bound"] = ""
     unknown_flux: bool = False
@@ -60,7 +60,7 @@ class Estimator:
 
     @property
     def network(self) -> str:
-        """Method whose network is used, this or another one; empty if none is."""
+        """Method whose network is used, this or another one; empty without a network."""
         return self.name if self.states else self.borrowed_network
 
     @property
@@ -72,10 +72,10 @@ class Estimator:
 ESTIMATORS = {
     estimator.name: estimator
     for estimator in (
-        # The aligned telescope, whatever the stamps: the error that a method must beat.
+        # The aligned telescope, for all stamps: the error that a method must beat.
         Estimator("constant", Look("always the middle", "black")),
-        # The paper's network: it learns noise-free stamps of the grid, and estimates from noisy
-        # ones.
+        # The paper's network: it is trained on noise-free stamps of the grid, and estimates from
+        # noisy ones.
         Estimator(
             "original",
             Look("CNN, noisy stamps", "#4d4d4d", paper=("original", "Original data")),
@@ -84,12 +84,12 @@ ESTIMATORS = {
             product="estimates",
             swept=("cnn", "train_original"),
         ),
-        # The same network behind the DAE, which takes the noise from the stamps.
+        # The same network behind the DAE, which removes the noise from the stamps.
         Estimator(
             "dae",
             Look("CNN, DAE output", "#0072b2", paper=("dae", "DAE PSF")),
             "dae",
-            denoised=True,
+            uses_dae=True,
             borrowed_network="original",
             product="estimates",
         ),
@@ -111,7 +111,7 @@ ESTIMATORS = {
             states="train",
             noisy=True,
             product="estimates",
-            denoised=True,
+            uses_dae=True,
         ),
         # Fits of single states, which start at the estimate of a network.
         Estimator(
@@ -146,7 +146,7 @@ ESTIMATORS = {
 def list_estimators(product: str, test_set: str = "uniform") -> list[Estimator]:
     """Return the methods of a product, or the bounds, in the order of its arrays.
 
-    Those with unknown flux and position are applied to uniform states only.
+    Methods with unknown flux and position are applied to uniform states only.
 
     Parameters
     ----------
@@ -162,11 +162,11 @@ def list_estimators(product: str, test_set: str = "uniform") -> list[Estimator]:
     ]
 
 
-def trained_networks() -> list[str]:
+def list_trained_networks() -> list[str]:
     """Return the names of the methods that have a network of their own."""
     return [name for name, estimator in ESTIMATORS.items() if estimator.states]
 
 
-def swept_networks() -> list[str]:
+def list_swept_networks() -> list[str]:
     """Return the names of the networks that sweeps may train."""
     return [name for name, estimator in ESTIMATORS.items() if estimator.swept]
