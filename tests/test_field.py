@@ -275,7 +275,7 @@ def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(field, s
     field, faint = replace(field, limits=PosteriorLimits(min_axes=SIDE**2)), Faint(30, snr)
     flux, sky = np.full(30, 1000.0), np.full(30, 3.0)
     result = faint.measured(field, centre=faint.centre, fixed=True, flux=flux, sky=sky)
-    at = faint.centre + field.listed[0]
+    at = faint.centre + field.list_error[0]
     nearest = np.square(field.places - at[:, None]).sum(axis=-1).argmin(axis=1)
     means = field.model.images(field.model.terms(faint.position), at, SIDE).reshape(30, -1)
     s = (faint.sigma[0] / 1000) ** 2
@@ -386,8 +386,8 @@ def test_large_frames_are_fitted_to_fewer_stars_the_brighter_the_likelier():
 
 
 def test_list_of_the_training_is_known(field):
-    assert field.listed[0] == pytest.approx([-0.1, -0.1], abs=0.03)
-    assert field.listed[1] == pytest.approx([0.05, 0.05], rel=0.5)
+    assert field.list_error[0] == pytest.approx([-0.1, -0.1], abs=0.03)
+    assert field.list_error[1] == pytest.approx([0.05, 0.05], rel=0.5)
 
 
 def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, stars, monkeypatch):

@@ -23,6 +23,8 @@ from command_line import psfdae
 from psfdae import Error, Stars, load_model, read_telescope
 from psfdae.denoise.bundle import bundle_arrays, bundle_bytes, locate_shipped_model, read_bundle
 from psfdae.denoise.field_models import load_field
+from psfdae.image.image_input import ImageInput
+from psfdae.photometry.image_photometry import measure_all_stars
 from psfdae.psf.exchange import write_psfex, write_stdpsf
 from psfdae.psf.interface import FieldPsfs
 from psfdae.training.settings import from_words
@@ -268,7 +270,8 @@ def call_python(folder, name):
     elif name == "model.psf.safetensors":
         load_model(path).predict(np.random.default_rng(1).normal(100, 9, (3, 16, 16)))
     elif name in ("field.psf", "stdpsf.fits"):
-        load_field(path).photometry(folder / "image.fits", folder / "list.csv")
+        source = ImageInput.build(folder / "image.fits", {"catalogue": folder / "list.csv"})
+        measure_all_stars(load_field(path), source)
     elif name == "telescope.yaml":
         read_telescope(path)
     else:

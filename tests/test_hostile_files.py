@@ -188,7 +188,7 @@ def test_columns_of_fits_tables_that_hold_arrays_are_no_numbers(tmp_path):
 def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipped):
     """Large stamps' way, on small ones: the same predictions but for rounding."""
     lean_basis = partial(bundles.build_flux_model, full_basis_max_px=0)
-    monkeypatch.setattr(bundles, "flux_model_of", lean_basis)
+    monkeypatch.setattr(bundles, "build_flux_model", lean_basis)
     lean = load_model()
     flux_model, rng = lean.bundle.flux_model, np.random.default_rng(3)
     assert flux_model.basis.shape[1] == lean.info.components < 256

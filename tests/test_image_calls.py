@@ -127,7 +127,7 @@ def test_models_are_copied_and_pickled_and_work_on_images_side_by_side(image, mo
         ("", None, "or detect=True", "or --detect"),
         ("gain", -1, "gain=-1:", "--gain -1:"),
         ("pixel_scale_arcsec", 0, "pixel_scale_arcsec=0:", "--pixel-scale 0:"),
-        ("saturate", 10.0, "saturate= takes that", "--saturate takes that"),
+        ("saturate", 10.0, "saturate= takes the", "--saturate takes the"),
         ("bad_bits", 4, "bad_bits= needs a mask", "--bad-bits needs a mask"),
         ("threshold", 1e7, "threshold= sets", "--threshold sets"),
         ("origin", 1, "detect=True takes an image", "--detect takes an image"),

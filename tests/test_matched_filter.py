@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 import psfdae
 from psfdae.image.image_input import ImageInput
+from psfdae.photometry.image_photometry import measure_all_stars
 from psfdae.photometry.matched_filter import find_stars, measure_snr
 from psfdae.psf.grid import PsfGrid
 from simulated_fields import CAMERA, TrueField, compare, false_share, simulate_field
@@ -135,7 +136,8 @@ FWHM_PX = 3.0, 3.65
 def test_faint_stars_of_a_crowded_field_are_found():
     """Few false ones, which have the flag FAINT; a search of pixels found 4 and 65 %."""
     field = simulate_field(300, 180, FWHM_PX, slope=0.5, seed=5)
-    table = TrueField(300, FWHM_PX).photometry(field.image, detect=True, **CAMERA)
+    source = ImageInput.build(field.image, {"detect": True, **CAMERA})
+    table = measure_all_stars(TrueField(300, FWHM_PX), source).table
     faint, middle, *_ = compare(table, field.stars, (4.0, 7.0, 14.0))
     assert faint["found"] >= 0.7 and middle["found"] >= 0.9
     assert abs(middle["bias"]) < 0.06

@@ -64,7 +64,10 @@ def equal(truth):
     """All values are the truth."""
 
     def check(values):
-        return np.array_equal(np.array(values), np.array(truth))
+        values = np.array(values)
+        # FITS has texts as bytes.
+        values = values.astype(str) if values.dtype.kind == "S" else values
+        return np.array_equal(values, np.array(truth))
 
     return check
 
