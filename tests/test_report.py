@@ -91,7 +91,7 @@ def checks(**changed):
     stars = {"snr": np.geomspace(5, 700, 60), "chi2": np.ones(60), "flags": np.zeros(60, int)}
     stars["part"] = np.where(np.arange(60) % 5 == 4, "held out", "training")
     measured = {"errors": errors((2e-6, 1e-6)), "photometry": photometry()}
-    measured |= {"coverage": {10.0: 0.68}, "degraded": {10.0: images, 50.0: images}}
+    measured |= {"coverage": {10.0: 0.68}, "denoised_images": {10.0: images, 50.0: images}}
     return check_stars(stars) + check_held_out("gmm", **measured | changed)
 
 
