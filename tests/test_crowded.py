@@ -476,3 +476,13 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
         assert ratio[part].std() == pytest.approx(0.011, abs=0.003)
     means = [images[part].mean(axis=0) for part in (single, ~single)]
     assert np.abs(means[0] - means[1]).max() < 0.01 * means[0].max()
+
+
+def test_of_two_stars_that_move_to_one_place_one_is_kept():
+    """The listed one, or of two that were found in residuals the brighter one."""
+    place = np.array([[10.0, 10.0], [30.0, 30.0], [10.3, 10.0], [50.0, 50.0], [50.2, 50.0]])
+    flux = np.array([100.0, 50.0, 500.0, 20.0, 30.0])
+    assert sorted(crowded.find_duplicates(place, flux, 2, 1.0)) == [2, 3]
+    swapped = crowded.find_duplicates(place[[0, 1, 2, 4, 3]], flux[[0, 1, 2, 4, 3]], 2, 1.0)
+    assert sorted(swapped) == [2, 4]
+    assert crowded.find_duplicates(place, flux, 2, 0.1).size == 0

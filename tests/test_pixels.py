@@ -590,3 +590,10 @@ def test_pixels_far_below_the_sky_are_left_out(clean):
     assert "left out: 1 dead pixels" in "\n".join(stars.notes)
     assert bright.bad[index].sum() == 1
     assert bright.stamps[index][bright.bad[index]] > -5 * bright.noise[index]
+
+
+def test_a_core_as_wide_as_the_image_has_no_spikes():
+    """A level of saturation below the sky makes almost all of an image one core."""
+    image = np.random.default_rng(3).normal(100.0, 1.0, (420, 420))
+    clean = np.zeros(image.shape, bool)
+    assert not add_trails(image, bad_pixels.BadPixels(clean, clean, ()), 90.0).mask.any()

@@ -1,6 +1,6 @@
 """What `import psfdae` gives: models, stars, and the calls that take a whole image.
 
-Each call opens its image (`ImageInput`) and leaves the work to a function of a lower room.
+Each call opens its image (`ImageInput`) and leaves the work to a function of another module.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class PsfModel(StarModel):
         catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
             Star list, as `Stars.from_image` takes it.
         fixed : bool
-            Its centres are exact, for models that measure centres (field).
+            Hold the centres of the list fixed, for models that measure centres (field).
         threads : int, optional
             By default, all cores.
         **options

@@ -73,7 +73,7 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
     Parameters
     ----------
     name : str
-        Words of the command, such as "alignment states".
+        Words of the command, such as "paper alignment states".
     settings : Reader, optional
         Makes what a parameter `config` receives, from trailing words or a file. Of the words of a
         repeatable argument beside `config`, those with = are settings.

@@ -359,11 +359,11 @@ class StampDenoiser(Denoiser):
         self._free_flux = method.free_flux()
 
     def _denoise(self, centred_stars: Sequence[CentredStars]) -> list[DenoisedStars]:
-        """Restore stars with the fluxes of the photometry, which the method may correct.
+        """Denoise stars with the fluxes of the photometry, which the method may correct.
 
-        A method that finds fluxes does so first, for stars of unknown flux and sky. It takes the
-        noise for larger then: what it does not know of a bright star would pass for flux. Parts are
-        denoised together, in which some stars have about the same noise.
+        A method that finds fluxes does so first, for stars of unknown flux and sky. It then adds
+        the noise floor to the noise, because errors of the PSF's shape would bias the flux of
+        bright stars. All parts are denoised in one call of the method.
         """
         # Photometry of all parts together, and stars without a flux.
         info = self.bundle.info
@@ -562,7 +562,7 @@ def compute_reduced_chi2(
 ) -> np.ndarray:
     """Return Σ r²/v over what is expected of it, over pixels that are not NaN, (n,).
 
-    A denoised star follows its own noise where it is bright. If the method knows the σ u of its
+    The PSF of a bright star absorbs a part of its noise. If the method knows the σ u of its
     pixels, in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at least 1 %, of
     what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
 

@@ -29,7 +29,10 @@ from psfdae.image.stamps import Stamps
 
 
 class Estimated(IntEnum):
-    """Case of a star: which of its flux and sky were estimated, because they were not given."""
+    """Case of a star: which of its flux and sky were estimated, because they were not given.
+
+    A star with a given flux and an estimated sky has the errors of the case FLUX_AND_SKY.
+    """
 
     NOTHING = 0
     FLUX = 1
@@ -55,7 +58,7 @@ class ModelErrors(NamedTuple):
     growth : ndarray, shape (4,)
         Coefficients (a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² +
         c w² + d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By
-        default it is the same at all places.
+        default it is the same at all places. Errors of sky and centre grow alike.
     """
 
     flux: float = 0.0

@@ -1,7 +1,7 @@
 """`StarModel`: a model of the PSF, with the call that denoises stars.
 
 A stamp, or an image with its star list, goes in; a `Prediction` with PSFs, their errors, fluxes and
-flags comes out. the steps are in `psfdae.denoise.denoiser`.
+flags comes out. The steps are in `psfdae.denoise.denoiser`.
 """
 
 from __future__ import annotations
@@ -156,8 +156,8 @@ class StarModel(FieldPsfs):
     ) -> Prediction:
         """Return the PSFs of stars, with uncertainties, photometry, shapes and flags.
 
-        Stars do not influence each other; the result does not depend on the number
-        of threads, and on how many stars are passed at once in its rounding at most.
+        Stars do not influence each other. The number of threads does not change a result; how many
+        stars are passed at once changes it at most at the level of rounding.
 
         Parameters
         ----------

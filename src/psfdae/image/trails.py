@@ -38,9 +38,10 @@ def add_trails(
 ) -> BadPixels:
     """Add the pixels of trails and spikes to the bad pixels of an image (h, w).
 
-    Without a trail, they are returned with the sky of the image, which was measured for the search,
-    unless the image is so large that its means over squares were searched. They are returned
-    unchanged if no sky can be measured, or if the image is smaller than a trail.
+    Without a trail or spike, they are returned with the sky of the image, which was measured for
+    the search, unless the image is so large that its means over squares were searched: lengths in
+    pixels of the search are then sides of these squares. They are returned unchanged if no sky can
+    be measured, or if the image is smaller than a trail.
 
     Parameters
     ----------
@@ -117,9 +118,12 @@ def find_spikes(
     for x, y, core_px in find_saturated_cores(is_saturated):
         middle = y, x
         first = int(2.0 * core_px / part_px) + 1
+        # Rays do not reach beyond a core as wide as an image whose level of saturation is wrong.
+        if first >= parts:
+            continue
         # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
         rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
-        # The lower quartile of a part: it is dark between stars in a row, and not along a spike.
+        # The lower quartile of a part: a row of separate stars has dark gaps, a spike has none.
         quartile = np.percentile(rays.reshape(angles, parts, part_px), 25, axis=2)
         light = np.ma.masked_invalid(quartile)
         light -= np.ma.median(light, axis=0)
@@ -282,8 +286,8 @@ def trail_on_line(
     start, end = int(edges[2 * longest]), int(edges[2 * longest + 1])
     if (end - start) * part_px < shortest_px or is_bright[start:end].mean() < 0.85:
         return None
-    # Between stars in a row it is dark; a trail may be uneven, but has light all along: the lowest
-    # of the heights over 2 px in a part and the next one are a third of the highest, or more.
+    # A row of separate stars has dark gaps; a trail may be uneven, but has light all along: of the
+    # heights over 2 px in a part and the next one, the 15th percentile is at least 0.3 of the 85th.
     short_part = ((along - along.min())[middle] / 2.0).astype(int)
     means = np.bincount(short_part, light[middle]) / np.maximum(np.bincount(short_part), 1)
     heights = means[4 * start : 4 * (end - 1)].reshape(-1, 4)

@@ -3,7 +3,8 @@
 All stars are fitted at once (`psfdae.photometry.joint_fit`). Stars that are fainter, or in the
 light of brighter ones, are then found where the models are subtracted
 (`psfdae.photometry.matched_filter`), and all are fitted again, on a sky without the light of stars,
-until no more are found. Stars that were found there with a flux below 3 σ are dropped. The light
+until no more are found, five times at most. Stars that were found there with a flux below 3 σ,
+which includes the errors of their neighbours' PSFs, are dropped. The light
 that a star has beyond its stamp is measured with them (`psfdae.psf.wings`).
 """
 
@@ -161,7 +162,7 @@ def photometry(
         # star lacks, or if it has moved to another star.
         sigma = np.hypot(fit.flux_error, _psf_doubt(place, flux, side, area_px))
         real = flux > min(threshold, 3.0) * sigma
-        real[pairs_within(place, 0.5 * fwhm)] = False  # of one star
+        real[find_duplicates(place, flux, observation.count, 0.5 * fwhm)] = False
         real[: observation.count] = True
         place, flux, origin = place[real], flux[real], origin[real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
@@ -186,6 +187,27 @@ def photometry(
     light = fit.light + wing_light
     result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
     return result.times(1.0 / unit)  # in the unit of the image
+
+
+def find_duplicates(
+    place: np.ndarray, flux: np.ndarray, listed_count: int, distance_px: float
+) -> np.ndarray:
+    """Return the numbers of stars that have moved onto another star, which is kept.
+
+    Parameters
+    ----------
+    place : ndarray, shape (n, 2)
+        Positions x and y, the stars of the list first.
+    flux : ndarray, shape (n,)
+        Of two stars that both were found in residuals, the fainter one is the duplicate.
+    listed_count : int
+        Number of stars of the list, which come before stars found in residuals.
+    distance_px : float
+        Distance within which two stars are one.
+    """
+    first, second = pairs_within(place, distance_px).T
+    is_first = (first >= listed_count) & (flux[first] < flux[second])
+    return np.asarray(np.where(is_first | (second < first), first, second))
 
 
 def tabulate_stars(

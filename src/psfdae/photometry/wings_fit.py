@@ -164,7 +164,7 @@ def fit_wings(
         is_used = ~bad[band]
         if earlier is not None:
             deviation = residual[band] - np.tensordot(earlier.profile, band_tents, 1)
-            # Stars and galaxies that nobody sees are left out: 4 σ is far for noise alone.
+            # Undetected stars and galaxies are left out: noise alone hardly exceeds 4 σ.
             is_used &= np.abs(deviation) < 4.0 * sigma[band]
         weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
         design = np.concatenate([band_tents, np.ones((1, *weight.shape))]) * weight
@@ -266,7 +266,7 @@ def around_stars(
     without_light = without_stars - light_of_wings
     sky = find_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
     del without_light
-    # The map is the most frequent value, below the mean for photon noise and undetected stars. Both
+    # The map estimates the mode, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
     deviation = (without_stars - sky.level - light_of_wings) / sigma
     is_excluded = sky.bad | (np.abs(deviation) > 4.0)
@@ -340,7 +340,8 @@ def measure_halo(
         offset = np.mgrid[window] - middle[:, None, None]
         radius = np.hypot(*offset)
         ring = np.where(bad[window], 0, np.digitize(radius, edges))
-        numbers = np.unique(ring)[1:-1]
+        # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
+        numbers = np.setdiff1d(ring, [0, len(edges)])
         level = ndimage.median(data, ring, numbers)
         log_radius = np.log(ndimage.mean(radius, ring, numbers))
         # The error of a median of n values is 1.25 σ/√n.
@@ -361,7 +362,7 @@ def measure_halo(
         height = np.interp(log_r, log_radius[:count], scaled_level)
         light = height * np.exp(slope * np.maximum(log_r - end, 0.0) - 3.0 * np.minimum(log_r, end))
         light[radius >= 256.0] = 0.0
-        # A core shows its middle to half a pixel: off by δ, it leaves −δ ∇h. Least squares of δ,
+        # The centre is known to half a pixel: an offset δ leaves −δ ∇h. Least squares of δ,
         # where uneven light counts as an error of 30 %.
         doubt = np.hypot(noise, 0.3 * light)
         is_fitted = (ring > 0) & (log_r < end) & (np.abs(data - light) < 3.0 * doubt)

@@ -1,7 +1,7 @@
 """`Wings`: light of stars outside the stamps of a model.
 
-The model has the light of a star within its stamp, over the light of a ring around it, taken for
-sky. The rest is one profile for all stars: a star of flux F has
+The model gives the light of a star within its stamp, above a sky that is measured in a ring around
+it. The rest is one profile for all stars: a star of flux F has
 
     F s (p_0 h_0 + Σ_k p_k h_k(r))
 
@@ -59,7 +59,8 @@ class Wings:
         Raises
         ------
         ValueError
-            If one is missing, they do not fit together, or their light exceeds the star's.
+            If one is missing, they do not fit together, or their light exceeds ten times the
+            star's.
         """
         # A number of another type, or one that is missing, is as wrong as one that does not fit.
         names = ("radius_px", "profile", "covariance")
@@ -211,7 +212,8 @@ def compute_prior_profile(
     Outside of a stamp of the half side h, the light falls off as a (r/h)^-5, the mean slope of
     Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the `outer_share` of the
     light, between 0.7 h and h. Its σ is half of a at h and falls as r^-3, as light that mirrors and
-    air scatter does (King 1971, PASP 83, 199), with 0.1 % of the star in quadrature.
+    air scatter does (King 1971, PASP 83, 199), with 0.1 % of the star in quadrature; σ of p_0 is
+    1.5 % of the star's light, spread over the stamp.
     """
     half = radius_px[0]
     # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.

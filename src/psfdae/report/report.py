@@ -233,7 +233,7 @@ def _predict_all(
     stars : ImageStars
         Bright stars of one or several images.
     shown : ndarray of int, shape (k,)
-        Numbers of the stars whose residuals are kept.
+        Numbers of the stars whose residuals are kept, ascending.
 
     Returns
     -------
@@ -260,8 +260,7 @@ def _predict_all(
         count += len(prediction)
     table = {name: np.concatenate(values) for name, values in columns.items()}
     table["flags"] = table["flags"].astype(int)
-    # Residuals came in the order of the stars: sort them back to the order of `shown`.
-    return table, np.concatenate(psfs), np.concatenate(residuals)[np.argsort(np.argsort(shown))]
+    return table, np.concatenate(psfs), np.concatenate(residuals)
 
 
 def level_scale(model: StarModel, stars: ImageStars, method_name: str) -> float:

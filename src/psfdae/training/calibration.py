@@ -46,7 +46,8 @@ class StarErrors:
     nodes : ndarray, shape (S,)
         Pixel RMS over the flux.
     error : ndarray, shape (S, N, d, d), float32
-        Moduli, as `HeldOutStars.errors` gives them.
+        Absolute errors (`HeldOutStars.errors`), in units of the method's σ of the pixel if it has
+        one, else of the flux.
     star : ndarray of int, shape (N,)
         Star of every error.
     distance : ndarray, shape (S, N)
@@ -112,8 +113,8 @@ class StarErrors:
     def half_width(self) -> np.ndarray:
         """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d).
 
-        At least a quarter of the root mean square: beside much noise of the stars' own, most errors
-        in a pixel may be 0.
+        At least a quarter of the root mean square: after the stars' own noise is subtracted, most
+        errors in a pixel may be 0.
         """
         # Quantile and root mean square over the stars, for each node and pixel.
         quantile = np.stack([np.quantile(node, COVERAGE, axis=0) for node in self.error])
@@ -153,8 +154,8 @@ class StarErrors:
         """Return the least limit (S,) of normal distances (S, N) of as few stars as there are.
 
         Few stars do not show what 0.1 % exceed: the limit is for one more star after n normal
-        distances, mean + t (1 + 1/n)^½ σ with t of n − 1 degrees of freedom. It is 0 for a hundred
-        or more, whose own quantile says it.
+        distances, mean + t (1 + 1/n)^½ σ with t of n − 1 degrees of freedom, at least 2. It is 0
+        for a hundred or more, whose own quantile says it.
         """
         from scipy.stats import t
 
@@ -262,8 +263,8 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     centre = centre + images.shape[-1] // 2
 
     def compute_excess(offset: np.ndarray, sigma: np.ndarray) -> float:
-        """Return √(e² − σ²) for the e within which 68 % of normal errors are, or 95 % in 1.96 e."""
-        # e in units of σ, from both quantiles; the model's part of e² is the rest.
+        """Return √(e² − σ²), e the mean of the 68 % quantile and of the 95 % quantile over 1.96."""
+        # e in units of σ; the model's part of e² is the rest.
         ratio = np.abs(offset) / sigma
         scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, 0.95) / 1.96)
         return float(np.median(sigma) * np.sqrt(max(scale**2 - 1.0, 0.0)))
@@ -389,12 +390,12 @@ def _scales_at(
 
 
 def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
-    """Return the errors of a model with limits of outliers that its training stars do not exceed.
+    """Return the errors of a model with limits of outliers above 99 % of its training stars.
 
-    The noise of a training star is in the axes of the training, along which a star of the same
-    noise is an outlier by as much as there are few of them. Training stars have less noise than the
-    lowest node, whose limit applies to all brighter stars. Simulated stars are noise-free,
-    and change nothing.
+    The axes of the training contain the noise of few training stars, so that other stars of the
+    same noise look like outliers. Training stars have less noise than the lowest node, whose limit
+    applies to all brighter stars: it becomes at least 1.1 times the 99 % quantile of the training
+    stars. Simulated stars are noise-free, and change nothing.
     """
     errors = model.bundle.errors
     if errors.outlier_limit is None or (bright := stars.bright) is None:

@@ -104,7 +104,7 @@ def describe_settings(stars: ImageStars, kind: type[Method]) -> dict[str, Any]:
     stars : ImageStars
         Bright stars of an image, with their settings.
     kind : type of Method
-        The fitted method, whose groups of settings count beside split and truth.
+        The fitted method, whose groups of settings are described with the split and the reference.
     """
     group_settings = stars.settings.model_dump(include={*list_groups(kind.name)})
     return describe_fit(kind, group_settings, ImageStars.split_kind, ImageStars.reference)

@@ -141,7 +141,7 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
                 start = starts[nearest] if nearest and distance[nearest] < 0.04 else None
                 model = fit_image(stars, start)
                 results[name] |= measure_image(results[name], stars, model, folder)
-                # Where the optics are known, one image of each job gives the telescope's state.
+                # Where the optics are known, one image of each group gives the telescope's state.
                 if not starts and (telescope := results[name].get("telescope_file")):
                     results[name] |= fit_telescope(stars, Path(str(telescope)))
                 results[name]["start"] = nearest if model.info.adapted else ""
@@ -355,8 +355,8 @@ def measure_image(
     -------
     dict
         Time, airmass; FWHM (px) and ellipticity at `PLACES`, order of the field; numbers
-        of bright, measured and flagged stars; magnitude of the 20th brightest star in counts;
-        zero point and its scatter; median χ² of the stars.
+        of bright, measured and flagged stars; magnitude of the 20th brightest star without a flag
+        in counts, NaN if there are fewer; zero point and its scatter; median χ² of the stars.
     """
     from psfdae.photometry.image_photometry import measure_all_stars
     from psfdae.report.validation import validate
@@ -384,7 +384,7 @@ def measure_image(
         "bright_stars": len(stars),
         "stars": len(table),
         "flagged": int(has_flag.sum()),
-        "mag_20th": -2.5 * math.log10(brightest[-1]) if len(brightest) else math.nan,
+        "mag_20th": -2.5 * math.log10(brightest[-1]) if len(brightest) == 20 else math.nan,
         "zero_point": table.meta.get("ZEROPT", math.nan),
         "zero_point_scatter": table.meta.get("ZEROPTSD", math.nan),
         "chi2": float(np.nanmedian(np.array(table["chi2"], float))),
