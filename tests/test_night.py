@@ -396,13 +396,16 @@ def test_killed_and_typed_again_gives_the_same_files(folder, truth, tmp_path):
     products, images = [], f"{folder}/exposure_00[0-3].fits"
     for is_killed in (False, True):
         place = copy_of_sources(tmp_path / str(is_killed))
-        rules = place / "workflow/rules/common_night.smk"
+        rules = place / "src/psfdae_paper/workflow/night.py"
         text = rules.read_text()
         assert text.count("IMAGES_PER_JOB = 10") == 1
         rules.write_text(text.replace("IMAGES_PER_JOB = 10", "IMAGES_PER_JOB = 2"))
         words = ["snakemake", "night", "--cores", "2", "--config", f"images={images}"]
         words += [f"telescope={folder}/telescope.yaml"]
-        options = {"cwd": place, "env": environment(SOURCE_DATE_EPOCH="0")}
+        options = {
+            "cwd": place,
+            "env": environment(SOURCE_DATE_EPOCH="0", PYTHONPATH=f"{place}/src"),
+        }
         if is_killed:
             run = subprocess.Popen(words, **options, **QUIET)
             while not [*place.glob("results/night/images/*.html")] and run.poll() is None:
