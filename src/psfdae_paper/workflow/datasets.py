@@ -45,8 +45,16 @@ def list_simulated_datasets() -> list[str]:
 
 
 def list_datasets_except(names: Iterable[str]) -> list[str]:
-    """Return the simulated datasets except those with these names."""
-    return sorted(set(list_simulated_datasets()) - set(names))
+    """Return the simulated datasets without a rule of their name among these.
+
+    In another project's workflow, the name of the module and an underscore come before it.
+    """
+    endings = [f"_{name}" for name in names]
+    return sorted(
+        dataset
+        for dataset in list_simulated_datasets()
+        if not any(ending.endswith(f"_{dataset}") for ending in endings)
+    )
 
 
 def list_compared_methods(run: Run) -> list[str]:

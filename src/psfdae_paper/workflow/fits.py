@@ -142,11 +142,16 @@ def most_threads(run: Run, dataset: str) -> int:
 def list_new_rules(names: Iterable[str]) -> dict[str, str]:
     """Return rule and name of the methods that store a fit and lack a rule among these.
 
-    These are methods of other packages: the rules of our own are written out.
+    These are methods of other packages: the rules of our own are written out. In another project's
+    workflow, all names begin with the name of the module and an underscore.
     """
-    own_rules = set(names)
+    endings = tuple(f"_{name}" for name in names)
     methods_by_rule = {fit_files.get_rule_name(m): m.name for m in list_methods() if m.storage}
-    return {rule: name for rule, name in methods_by_rule.items() if rule not in own_rules}
+    return {
+        rule: name
+        for rule, name in methods_by_rule.items()
+        if not any(ending.endswith(f"_{rule}") for ending in endings)
+    }
 
 
 # Bundles.
