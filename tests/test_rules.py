@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from psfdae.base.files import write_text
-from psfdae_paper.workflow import alignment, datasets, fits, night, sweeps
+from psfdae_paper.workflow import alignment, datasets, fits, night, run, sweeps
 from psfdae_paper.workflow.run import (
     as_options,
     close_target,
@@ -208,3 +208,14 @@ def test_our_rules_are_found_by_their_names():
     assert len(re.findall(r"^ +rule:", text, re.M)) == 2
     assert not fits.list_new_rules(names)
     assert not datasets.list_datasets_except(names)
+
+
+@pytest.mark.parametrize("prefix", ["", "psfdae_"])
+def test_rules_of_a_module_are_known_by_their_own_names(prefix):
+    """A dataset called as the end of another rule has no rule yet."""
+    names = ["stars", *(f"{prefix}{name}" for name in ("baseline", "figure_errors", "dataset1"))]
+    own_rules = run.remove_module_name(names, "dataset1")
+    assert {"baseline", "figure_errors", "dataset1"} <= own_rules and "errors" not in own_rules
+    assert "dataset1" not in datasets.list_datasets_except(names)
+    assert "dataset2" in datasets.list_datasets_except(names)
+    assert "baseline" not in fits.list_new_rules(names)

@@ -56,8 +56,8 @@ def expand_keywords(
     """
     parameters: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
-        unpacked = re.fullmatch(r"Unpack\[(\w+)\]", str(parameter.annotation))
-        if unpacked is None:
+        keywords = re.fullmatch(r"Unpack\[(\w+)\]", str(parameter.annotation))
+        if keywords is None:
             parameters.append(parameter)
             continue
         # As in a stub file, `...` stands for a default that is described elsewhere.
@@ -68,7 +68,7 @@ def expand_keywords(
                 default=...,
                 annotation=reference.__forward_arg__,
             )
-            for name, reference in function.__globals__[unpacked[1]].__annotations__.items()
+            for name, reference in function.__globals__[keywords[1]].__annotations__.items()
         )
     return signature.replace(parameters=parameters)
 

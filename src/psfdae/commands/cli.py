@@ -198,12 +198,12 @@ class SettingsCommand(click.Command):
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the options of the command, then the options of each dataclass below a heading."""
         fields = [option for options in self.field_options.values() for option in options]
-        own: list[click.Parameter] = [
+        command_options: list[click.Parameter] = [
             option
             for option in self.get_params(ctx)
             if isinstance(option, click.Option) and option not in fields
         ]
-        for heading, options in {"Options": own, **self.field_options}.items():
+        for heading, options in {"Options": command_options, **self.field_options}.items():
             records = [option.get_help_record(ctx) for option in options]
             if rows := [record for record in records if record is not None]:
                 with formatter.section(heading):

@@ -49,17 +49,6 @@ class StarModel(FieldPsfs):
         `load` reads one from a file.
     method : Method, optional
         The method of its arrays; by default it is unpacked from them.
-
-    Examples
-    --------
-    >>> prediction = model.predict(stamps, position=xy)
-    >>> prediction.psf.shape
-    (36, 16, 16)
-    >>> model.psf_at(150.0, 150.0, oversampling=1).shape
-    (16, 16)
-    >>> model.save("image.psf.safetensors")
-    >>> StarModel.load("image.psf.safetensors").info.training_stars
-    29
     """
 
     margin_px: ClassVar[int] = 2

@@ -21,6 +21,7 @@ from psfdae_paper.workflow.run import (
     exit_in_one_line,
     list_default_datasets,
     load_dataset_config,
+    remove_module_name,
 )
 
 OWN_STARS = "from_stars"
@@ -49,12 +50,7 @@ def list_datasets_except(names: Iterable[str]) -> list[str]:
 
     In another project's workflow, the name of the module and an underscore come before it.
     """
-    endings = [f"_{name}" for name in names]
-    return sorted(
-        dataset
-        for dataset in list_simulated_datasets()
-        if not any(ending.endswith(f"_{dataset}") for ending in endings)
-    )
+    return sorted(set(list_simulated_datasets()) - remove_module_name(names, "dataset1"))
 
 
 def list_compared_methods(run: Run) -> list[str]:

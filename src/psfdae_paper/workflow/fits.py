@@ -15,6 +15,7 @@ from psfdae_paper.workflow.run import (
     Wildcards,
     hash_code,
     load_dataset_config,
+    remove_module_name,
     settings,
 )
 
@@ -145,13 +146,9 @@ def list_new_rules(names: Iterable[str]) -> dict[str, str]:
     These are methods of other packages: the rules of our own are written out. In another project's
     workflow, all names begin with the name of the module and an underscore.
     """
-    endings = tuple(f"_{name}" for name in names)
+    own_rules = remove_module_name(names, "baseline")
     methods_by_rule = {fit_files.get_rule_name(m): m.name for m in list_methods() if m.storage}
-    return {
-        rule: name
-        for rule, name in methods_by_rule.items()
-        if not any(ending.endswith(f"_{rule}") for ending in endings)
-    }
+    return {rule: name for rule, name in methods_by_rule.items() if rule not in own_rules}
 
 
 # Bundles.

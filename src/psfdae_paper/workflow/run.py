@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -389,3 +389,19 @@ def as_options(wildcards: Wildcards, input: Any) -> list[str]:
 def match_any(names: Sequence[str]) -> str:
     """Return the pattern of a wildcard that is one of these names; "none" for an empty list."""
     return "|".join(names) or "none"
+
+
+def remove_module_name(names: Iterable[str], own_name: str) -> set[str]:
+    """Return the names of our rules without the name of the module, if the workflow is one.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names of all rules so far, which may include rules of another project.
+    own_name : str
+        One of our rules, which shows what comes before all of their names.
+    """
+    all_names = list(names)
+    own_full_name = next(name for name in all_names if name.endswith(own_name))
+    prefix = own_full_name.removesuffix(own_name)
+    return {name.removeprefix(prefix) for name in all_names if name.startswith(prefix)}
