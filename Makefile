@@ -184,7 +184,7 @@ nightly: env ## The slow tests; PART=3/7: the third seventh of their files
 test-all: test nightly ## The tests, then the slow ones
 
 test-light: env ## The commands and Python lines of the pages in a plain installation
-	$(PYTEST) -m slow tests/test_light_install.py
+	$(PYTEST) -m slow tests/docs/test_light_install.py
 
 test-docs: env ## Every command of README and docs as it is written
 	pytest -m written

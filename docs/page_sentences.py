@@ -1,6 +1,6 @@
 """Sentences and rows of pages with numbers, as the tables of the repository give them.
 
-`tests/test_docs.py` compares them with the pages, and prints the sentences to renew.
+`tests/docs/test_docs.py` compares them with the pages, and prints the sentences to renew.
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ from psfdae_paper.alignment.telescope import (
 )
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import clear_caches, config_dir, load
+from tracked_results import Site
 from workflow_runs import PATH, snakemake
 
 
@@ -193,3 +194,18 @@ def training(shared_folder):
         if missing:
             training_files.make()
     return training_files
+
+
+@pytest.fixture
+def site(tmp_path, empty_database, monkeypatch):
+    """A results folder with its own copy of the database."""
+    from psfdae_paper import registry
+
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    # The stage sets these; setenv makes pytest restore them.
+    monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    monkeypatch.setattr(registry, "make_bundle", lambda *arguments: None)
+    monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
+    return Site(tmp_path, empty_database)

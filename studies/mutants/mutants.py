@@ -61,7 +61,7 @@ TESTS_LEFT_OUT = [
 ]
 OPTIONS = ["-q", "-n0", "-p", "no:cacheprovider", "--tb=short", "--ignore=tests/stress"]
 OPTIONS += ["-m", "not slow and not written and not workflow"]
-OPTIONS += [f"--ignore-glob=tests/test_{name}.py" for name in TESTS_LEFT_OUT]
+OPTIONS += [f"--ignore-glob=*/test_{name}.py" for name in TESTS_LEFT_OUT]
 
 
 class CallRecorder:

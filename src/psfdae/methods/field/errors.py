@@ -215,8 +215,8 @@ def flux_error_over_field(
 
     For a star m' of another field, the model m gives the flux Σ m m' / Σ m². The variance is the
     sum of two parts: fields with other noise, and fields of other stars, which include the effect
-    of neighbours. Each part alone is too small for bright stars (`tests/test_stated_errors.py`),
-    because none of the fields contains structure that the polynomial cannot follow.
+    of neighbours. Each part alone is too small for bright stars (`test_stated_errors.py`), because
+    none of the fields contains structure that the polynomial cannot follow.
 
     Parameters
     ----------

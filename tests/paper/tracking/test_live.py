@@ -5,14 +5,12 @@ from __future__ import annotations
 import pytest
 
 from psfdae.methods.networks.training import listener
-from test_track import HISTORY, site  # noqa: F401
+from tracked_results import HISTORY
 
 
 @pytest.mark.parametrize("place", ["dae/dataset3/random-template.pt", "knee-1.pt"])
 def test_epochs_appear_as_they_are_trained_and_the_finished_run_replaces_them(
-    site,  # noqa: F811
-    monkeypatch,
-    place,
+    site, monkeypatch, place
 ):
     monkeypatch.setenv("PSFDAE_EPOCHS", "psfdae_paper.stages.live:logger")
     monkeypatch.setenv("PSFDAE_RESULTS", str(site.results))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from docs_pages import ROOT
 from psfdae.base.files import ProductError
 from psfdae_paper import source
 from psfdae_paper.stages import record
 
-ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
 SLOW = "paper/tables/psf_metrics.csv"
 """A table that takes long: it may stay from the record before."""

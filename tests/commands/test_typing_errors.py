@@ -8,8 +8,7 @@ import pytest
 
 import psfdae as library
 from command_line import psfdae
-
-ROOT = Path(__file__).resolve().parents[1]
+from docs_pages import ROOT
 
 
 @pytest.fixture(scope="module")

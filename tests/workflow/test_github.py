@@ -1,12 +1,12 @@
 """Jobs on GitHub: what they run can be run here, and nobody can exchange what they use."""
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
+from docs_pages import ROOT
+
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 
 

@@ -19,6 +19,7 @@ from scipy.stats import norm
 import known_field as known
 from command_line import printed
 from image_training import few_draws
+from known_wavefronts import SKY, field_of, imaged, sensed, three_terms
 from psfdae import StarFlag, load_model
 from psfdae.base.files import write_csv
 from psfdae.report import validation
@@ -30,7 +31,6 @@ from psfdae.telescope.settings import Prior
 from psfdae_paper.evaluation.night import TABLE_COLUMNS, read_night
 from psfdae_paper.stages import night
 from psfdae_paper.stars.nights import PLACES, measure_places
-from test_sensing import SKY, field_of, imaged, sensed, three_terms
 
 STAMP, ZERO_POINT = 14, 25.0
 WRONG = {"20 % more": 1.2, "20 % less": 1 / 1.2, "of the other sign": -1.0}

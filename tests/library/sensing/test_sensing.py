@@ -13,6 +13,7 @@ from astropy.table import Table
 import psfdae
 from command_line import printed
 from docs_pages import blocks, read
+from known_wavefronts import SKY, example, field_of, imaged, sensed, three_terms
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening, Profile
@@ -29,40 +30,6 @@ from psfdae.telescope.field import build_terms, model_telescope
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load
-
-SKY = 1000.0
-
-
-def example(kind):
-    return read_telescope(config_dir() / "telescope" / f"example_{kind}.yaml")
-
-
-def three_terms():
-    """The example with focus, astigmatism and coma alone."""
-    telescope = example("zernike")
-    terms = {name: telescope.aberrations.terms[name] for name in ("z4", "z6", "z8")}
-    aberrations = telescope.aberrations.model_copy(update={"terms": terms})
-    return telescope.model_copy(update={"aberrations": aberrations})
-
-
-def field_of(telescope, count, rng):
-    return rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
-
-
-def sensed(counts, telescope, angle, **options):
-    options = {"noise": SKY**0.5, "gain": 1.0, **options}
-    return psfdae.wavefront(counts, telescope, field_deg=angle, **options)
-
-
-def imaged(telescope, angle, coefficients, place, snr, rng=None):
-    """Stamps in counts of gain 1, noise-free without a generator, and fluxes."""
-    terms = build_terms(telescope, angle)
-    waves = np.einsum("mk,mkj->mj", coefficients, terms.to_modes)
-    operator = StarOptics(telescope, terms, 16).operator
-    images = operator.stamps(np.concatenate([waves, place], axis=1)).astype(float)
-    flux = snr * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))
-    mean = flux[:, None, None] * images + SKY
-    return (mean if rng is None else rng.poisson(mean).astype(float)), flux
 
 
 @pytest.fixture

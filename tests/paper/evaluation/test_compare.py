@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from itertools import combinations, product
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from command_line import printed, psfdae, refused
+from docs_pages import ROOT
 from psfdae.base.files import write_text
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import (
@@ -18,7 +18,6 @@ from psfdae_paper.evaluation.comparison import (
 )
 
 FIELDS, STARS = 20, 400
-ROOT = Path(__file__).resolve().parents[1]
 RECORD = ROOT / "results/reference"
 MEASURED = {("d", "realisation", "dae"): 0.03, ("d", "realisation", "pca_som"): 0.01}
 """Scatter of a dataset d; that of its noisy images is not measured."""

@@ -6,14 +6,14 @@ import re
 import tomllib
 from collections import defaultdict
 from importlib.metadata import version
-from pathlib import Path
 
 import yaml
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).resolve().parents[1]
+from docs_pages import ROOT
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TORCH = re.search(r"^torch==(.+)$", (ROOT / "requirements/torch.in").read_text(), re.M)[1]
 CONDA_NAMES = {

@@ -22,7 +22,6 @@ from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measurement import Task
-from test_track import site  # noqa: F401
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
@@ -242,7 +241,7 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
         assert best_point["point"] == f"{number:012x}"
 
 
-def test_sweep_is_a_parent_run_with_a_child_per_point(site):  # noqa: F811
+def test_sweep_is_a_parent_run_with_a_child_per_point(site):
     def actions():
         receipt = site.results / "receipt.csv"
         track.track(site.results, "smoke", site.database, receipt, sweeps=("tried",))

@@ -22,8 +22,11 @@ SMALL = ("parts.train_stars=60", "parts.test_stars=20")
 """Makes `psfdae train` quick."""
 
 TESTED_ELSEWHERE = {
-    **{f"docs/{name}.md": "test_from_stars.py" for name in ("training", "photometry")},
-    "docs/own_telescope.md": "test_own_telescope.py",
+    **{
+        f"docs/{name}.md": "library/training/test_from_stars.py"
+        for name in ("training", "photometry")
+    },
+    "docs/own_telescope.md": "docs/test_own_telescope.py",
 }
 """Pages whose commands another test runs from first to last."""
 
