@@ -109,7 +109,7 @@ def tree(tmp_path_factory):
     text = path.read_text()
     assert text.count("gmm_position]") == 1
     path.write_text(text.replace("gmm_position]", "gmm_position, shrunk]"))
-    (root / "config/sweep/tried.yaml").write_text(yaml.safe_dump(SWEEP))
+    (root / "config/sweep/tried.yaml").write_text(yaml.safe_dump({"tried": SWEEP}))
     return root
 
 

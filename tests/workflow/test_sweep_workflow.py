@@ -40,7 +40,7 @@ def configure(tmp_path_factory):
     shutil.copytree(config_dir(), folder)
 
     def write(**changes):
-        text = yaml.safe_dump(GRID | changes, sort_keys=False)
+        text = yaml.safe_dump({"tried": GRID | changes}, sort_keys=False)
         (folder / "sweep/tried.yaml").write_text(text)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -1,5 +1,5 @@
 wildcard_constraints:
-    sweep=match_any(list_sweeps()),
+    sweep=r"[^/]+",
 
 
 # States of their own choose between networks: all others train or test.

@@ -39,7 +39,7 @@ class Groups:
     foreign_options: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(
             ("-m", "--multirun"),
-            "several values are a sweep: name them in a file config/sweep/NAME.yaml, then "
+            "several values are a sweep: give them a NAME in a file of config/sweep, then "
             "snakemake sweep --config sweep=NAME (docs/sweeps.md)",
         ),
         "--cfg": "psfdae paper config OVERRIDES prints the composed configuration",

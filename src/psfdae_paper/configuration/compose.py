@@ -231,8 +231,8 @@ def _require_known_groups(tree: Mapping[str, Any]) -> None:
 Model = TypeVar("Model", bound=Group)
 
 
-def load_file(model: type[Model], path: Path) -> Model:
-    """Read and check a file of the configuration that Hydra does not compose.
+def load_file(model: type[Model], path: Path, name: str | None = None) -> Model:
+    """Read and check a file of the configuration that Hydra does not compose, or an entry of it.
 
     Parameters
     ----------
@@ -240,11 +240,13 @@ def load_file(model: type[Model], path: Path) -> Model:
         Class with the keys of the file, such as `Sweep`.
     path : Path
         YAML file.
+    name : str, optional
+        Entry of the file; by default all of it.
 
     Raises
     ------
     ConfigError
-        One line per wrong key: file, key, allowed values.
+        One line per wrong key: file, entry, key, allowed values.
     """
     from omegaconf import OmegaConf
 
@@ -256,12 +258,13 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    with _name_in_errors(path):
-        return parse_settings(model, tree if isinstance(tree, dict) else {})
+    tree = tree if isinstance(tree, dict) else {}
+    with _name_in_errors(path if name is None else f"{path}: {name}"):
+        return parse_settings(model, tree if name is None else tree[name])
 
 
 @contextmanager
-def _name_in_errors(path: Path) -> Iterator[None]:
+def _name_in_errors(path: Path | str) -> Iterator[None]:
     """Begin each line of a ConfigError with the name of the file that is checked."""
     try:
         yield

@@ -1,17 +1,19 @@
 """Configuration of a sweep (`config/sweep/*.yaml`): its axes, and the choice of the best point.
 
-The input is a file such as `config/sweep/dae_width.yaml`, the output a checked `Sweep`.
+The input is the name of a sweep in one of these files, the output a checked `Sweep`.
 `psfdae_paper.sweeps.points` computes its points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from psfdae.base.errors import did_you_mean
+from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae.methods import list_groups, method
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment
@@ -30,7 +32,7 @@ Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 class Axis(Group):
     """Setting that a sweep varies: listed values, named sets of values, or a range.
 
-    A file `config/sweep/NAME.yaml` has an axis for each name below `space`, such as
+    A sweep has an axis for each name below `space`, such as
     `train.lr: {low: 1.0e-4, high: 1.0e-2, log: true}` or `gmm.components: [[4], [16], [64]]`.
     """
 
@@ -150,9 +152,9 @@ class Axis(Group):
 class Sweep(Group):
     """Points of one model that are trained alike and compared by one metric.
 
-    It is a file `config/sweep/NAME.yaml`. `psfdae paper sweep list NAME` prints its points, the
-    target `sweep` of the workflow trains and compares them, and `psfdae paper best NAME` prints the
-    best one.
+    A file of `config/sweep` has it by its name. `psfdae paper sweep list NAME` prints its points,
+    the target `sweep` of the workflow trains and compares them, and `psfdae paper best NAME` prints
+    the best one.
     """
 
     # Model and data of the trainings.
@@ -316,25 +318,40 @@ def list_point_groups(model: str) -> tuple[str, ...]:
     return (*list_groups(model), "evaluation")
 
 
-def list_sweeps() -> list[str]:
-    """Return the names of the sweeps of the configuration folder."""
-    return sorted(path.stem for path in config_dir().glob("sweep/[!_]*.yaml"))
+def find_sweeps() -> dict[str, Path]:
+    """Return the file of each sweep of the configuration folder, by the name of the sweep.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a file is not a mapping of sweeps by their names, or a name is in two files.
+    """
+    files: dict[str, Path] = {}
+    for path in sorted(config_dir().glob("sweep/[!_]*.yaml")):
+        for name, sweep in read_yaml(path).items():
+            if not isinstance(sweep, Mapping):
+                raise ConfigError(f"{path}: {name}: expected sweeps by name, NAME: {{kind: …}}")
+            if name in files:
+                raise ConfigError(f"{path}: {name}: is also in {files[name].name}")
+            files[str(name)] = path
+    return files
 
 
 def load_sweep(name: str) -> Sweep:
-    """Read and check a file of `config/sweep`.
+    """Read and check a sweep of `config/sweep`.
 
     Parameters
     ----------
     name : str
-        Name of the file, without its suffix.
+        Name of the sweep in its file.
 
     Raises
     ------
-    ConfigError
+    ConfigError, ProductError
         If the sweep does not exist, or with one line per wrong key: file, key, allowed values.
     """
-    if name not in (names := list_sweeps()):
-        hint = did_you_mean(name, names)
-        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(names)}{hint}")
-    return load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")
+    files = find_sweeps()
+    if name not in files:
+        hint = did_you_mean(name, sorted(files))
+        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sorted(files))}{hint}")
+    return load_file(Sweep, files[name], name)

@@ -99,7 +99,7 @@ def sweep_point(
     Parameters
     ----------
     name : str
-        Name of the sweep, a file of config/sweep.
+        Name of the sweep in a file of config/sweep.
     data : sequence of pairs
         Role and product: stars; for scene 3 states, validation and test.
     checkpoint : Path

@@ -41,7 +41,7 @@ def sweep_summary(
     Parameters
     ----------
     name : str
-        Name of the sweep, a file of config/sweep.
+        Name of the sweep in a file of config/sweep.
     points : Path
         Folder with a folder for each point.
     out : Path

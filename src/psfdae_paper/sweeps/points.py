@@ -20,7 +20,6 @@ from psfdae.base.errors import Error, did_you_mean
 from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError, leaves
 from psfdae_paper.configuration.alignment import Alignment
-from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     compose,
     drop_neutral_settings,
@@ -29,7 +28,7 @@ from psfdae_paper.configuration.compose import (
     validate_tree,
 )
 from psfdae_paper.configuration.consistency import SIMULATION
-from psfdae_paper.configuration.sweep import Axis, Sweep, Value, load_sweep
+from psfdae_paper.configuration.sweep import Axis, Sweep, Value, find_sweeps, load_sweep
 
 
 class SweepError(Error, ValueError):
@@ -148,9 +147,9 @@ class Plan:
     Attributes
     ----------
     name : str
-        File of `config/sweep`, without its ending.
+        Name of the sweep in a file of `config/sweep`.
     sweep : Sweep
-        Content of this file.
+        Checked sweep.
     tree : dict
         Whole configuration that the points start from.
     """
@@ -222,14 +221,15 @@ class Plan:
         self, keys: Mapping[str, Value], values: Mapping[str, Value]
     ) -> dict[str, Any]:
         """Return the groups of a point with some keys set; SweepError names file and point."""
-        # A value that the configuration rejects is a mistake in the sweep's file.
-        path = config_dir() / "sweep" / f"{self.name}.yaml"
+        # A value that the configuration rejects is a mistake in the sweep.
         try:
             config = validate_tree(set_values(self.tree, keys)).model_dump()
         except (SweepError, ConfigError) as error:
             settings = ", ".join(f"{name}={value}" for name, value in values.items())
             point = f" (point {settings})" if values else ""
-            raise SweepError(f"{path}: {str(error).splitlines()[0]}{point}") from None
+            path = find_sweeps()[self.name]
+            message = f"{path}: {self.name}: {str(error).splitlines()[0]}{point}"
+            raise SweepError(message) from None
         return select_stage_groups(self.sweep.reads, config)
 
     @cached_property
@@ -248,7 +248,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     Parameters
     ----------
     name : str
-        File of `config/sweep`, without its ending.
+        Name of the sweep in a file of `config/sweep`.
     overrides : sequence of str
         Hydra overrides of the whole workflow, with the preset.
 
@@ -257,7 +257,7 @@ def plan_sweep(name: str, overrides: Sequence[str] = ()) -> Plan:
     ConfigError, SweepError
         If a file is wrong; the message names file and key.
     """
-    # What is varied, from the file of the sweep.
+    # What is varied.
     sweep = load_sweep(name)
     # The configuration of the sweep's dataset, with those overrides that concern it.
     tree = compose((*sweep.choice, *select_overrides(overrides, sweep.choice)))

@@ -44,7 +44,7 @@ class CommandLine(Group):
     set: str = ""
     """Hydra overrides for every dataset, separated by spaces."""
     sweep: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]*$")] = ""
-    """File of config/sweep, for the target sweep."""
+    """Sweep of a file of config/sweep, for the target sweep."""
     images: str = ""
     """Images of a night, as night/*.fits or a CSV list, for the target night."""
     telescope: str = ""

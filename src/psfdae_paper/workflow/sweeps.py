@@ -6,7 +6,7 @@ from functools import cache
 
 from psfdae.methods import method
 from psfdae_paper.configuration.estimators import list_swept_networks
-from psfdae_paper.configuration.sweep import list_sweeps
+from psfdae_paper.configuration.sweep import find_sweeps
 from psfdae_paper.source import source_hash
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
 from psfdae_paper.workflow.datasets import stars_file
@@ -91,7 +91,7 @@ def sweep_products(run: Run) -> list[str]:
     """Return all files that the target sweep builds."""
     name = run.sweep
     if not name:
-        names = ", ".join(list_sweeps())
+        names = ", ".join(sorted(find_sweeps()))
         raise SweepError(f"which sweep? --config sweep=NAME, one of {names}")
     sweep_plan(run, name)
     folder = f"{run.results}/sweeps/{name}"

@@ -114,7 +114,7 @@ def test_every_key_has_a_comment(path):
 
 
 def test_the_folder_has_few_files_and_a_short_page():
-    assert len([*config_dir().rglob("*.yaml")]) <= 40
+    assert len([*config_dir().rglob("*.yaml")]) <= 30
     assert len((config_dir() / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
 

@@ -7,9 +7,10 @@ import pandas as pd
 import pytest
 import yaml
 
+from psfdae.base.files import ProductError
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.configuration.sweep import Axis, list_sweeps, load_sweep
+from psfdae_paper.configuration.sweep import Axis, find_sweeps, load_sweep
 from psfdae_paper.sweeps import adaptive
 from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep
 
@@ -32,14 +33,14 @@ def sweep(config_folder):
     """Writes a sweep into a copy of the configuration and plans it."""
 
     def plan(tree, *overrides, name="tried"):
-        text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
+        text = tree if isinstance(tree, str) else yaml.safe_dump({name: tree}, sort_keys=False)
         (config_folder / f"sweep/{name}.yaml").write_text(text)
         return plan_sweep(name, ("preset=smoke", *overrides))
 
     return plan
 
 
-@pytest.mark.parametrize("name", list_sweeps())
+@pytest.mark.parametrize("name", sorted(find_sweeps()))
 def test_every_shipped_sweep_can_be_planned(name):
     plans = [plan_sweep(name, (f"preset={preset}",)) for preset in ("fast", "paper")]
     assert all(5 <= len(plan.points) <= 24 for plan in plans)
@@ -61,7 +62,7 @@ def test_names_depend_on_content_not_on_order_or_format(sweep):
     space = dict(reversed(GRID["space"].items())) | {"train.lr": [0.004, 0.001]}
     reordered = dict(reversed(GRID.items())) | {"space": space}
     assert set(sweep(reordered).points) == names
-    text = yaml.safe_dump(GRID).replace("0.001", "1e-3").replace("0.004", "4.0E-3")
+    text = yaml.safe_dump({"tried": GRID}).replace("0.001", "1e-3").replace("0.004", "4.0E-3")
     assert "1e-3" in text
     assert set(sweep(text).points) == names
     grown = {**GRID["space"], "train.lr": [0.0005, 0.001, 0.004]}
@@ -97,7 +98,7 @@ def test_points_are_measured_at_the_dataset_s_levels_whatever_they_train_on():
         ({"space": {"train.lr": [0.1, 7]}}, r"train\.lr = 7: .* \(point train\.lr=7\)"),
         (
             {"kind": "adaptive", "trials": 3, "space": {"train.lr": {"low": 0.1, "high": 2}}},
-            r"tried\.yaml: train\.lr = 2\.0: ",
+            r"tried\.yaml: tried: train\.lr = 2\.0: ",
         ),
     ],
 )
@@ -106,9 +107,14 @@ def test_every_mistake_is_named_before_any_work(sweep, change, message):
         assert sweep({**GRID, **change}).points
 
 
-def test_damaged_file_and_unknown_name_are_named(sweep):
-    with pytest.raises(ConfigError, match=r"tried\.yaml: .*line"):
+def test_damaged_file_and_unknown_name_are_named(sweep, config_folder):
+    with pytest.raises(ProductError, match=r"tried\.yaml: .*line"):
         sweep("kind: [grid\n")
+    with pytest.raises(ConfigError, match=r"tried\.yaml: kind: expected sweeps by name"):
+        sweep("kind: grid\nmodel: dae\n")
+    with pytest.raises(ConfigError, match=r"tried\.yaml: gmm: is also in baselines\.yaml"):
+        sweep("gmm: {kind: grid}\n")
+    (config_folder / "sweep/tried.yaml").unlink()
     with pytest.raises(ConfigError, match=r"sweep = 'nothing': .*dae_width"):
         load_sweep("nothing")
 
