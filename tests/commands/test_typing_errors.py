@@ -44,7 +44,7 @@ LISTED = "image.fits --catalogue stars.csv --origin 0"
         ("describe nowhere/m.psf.safetensors", "nor is there a folder nowhere"),
         ("wavefront image.fits --detect --telescope telescop.yaml --out o.fits", "telescope.yaml?"),
         ("wavefront image.fits --detect --telescope telescope.yaml --out o.fits", "diameter_m?"),
-        ("simulate telescope=wfsat_litteral", "did you mean wfsat_literal?"),
+        ("simulate telescope=example_seidle", "did you mean example_seidel?"),
         ("config telescope.wavelenght_m=1", "did you mean telescope.wavelength_m?"),
         ("config dataset=datset3", "did you mean dataset3?"),
         ("config datset=dataset3", "did you mean dataset?"),

@@ -437,7 +437,7 @@ def select_overrides(overrides: Sequence[str], choice: Sequence[str] = ()) -> tu
 
     The workflow takes one list for everything. A key that only other datasets have is left
     out; a key that is unknown to all datasets is kept, so that it is rejected by name. Options of a
-    group, such as telescope=wfsat_literal, apply to all datasets, but to scene 3 only presets.
+    group, such as telescope=ideal_1m, apply to all datasets, but to scene 3 only presets.
 
     Parameters
     ----------

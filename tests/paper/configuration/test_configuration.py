@@ -31,7 +31,7 @@ def settings_of(dataset):
 @pytest.mark.parametrize(
     ("override", "key"),
     [
-        ("telescope=wfsat_literal", "telescope.name"),
+        ("telescope=ideal_1m", "telescope.name"),
         ("telescope.obscuration=0.2", "telescope.obscuration"),
         ("grid.points=7", "grid.points"),
         ("wavefront.coma=3", "wavefront.coma"),
@@ -169,7 +169,9 @@ def test_search_distances_follow_from_the_telescope():
         config = settings_of(dataset)
         assert (config.framing.search_px, config.stars.search_px) == (24, px)
         assert "search_lambda_d" not in config.model_dump()["stars"]
-    stated = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
+    stated = load(
+        ["telescope.pixel_scale_arcsec=0.01", "framing.search_px=100", "stars.search_lambda_d=5"]
+    )
     assert (stated.framing.search_px, stated.stars.search_px) == (100, 57)
 
 
