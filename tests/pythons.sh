@@ -3,6 +3,8 @@
 # .venvs/PYTHON-RESOLUTION: the newest versions of every dependency (RESOLUTION=highest), or the
 # lowest that pyproject.toml allows (lowest-direct). versions.txt in it says which these are.
 set -eu
+PYTHONS=${PYTHONS:-3.11 3.12 3.13 3.14}
+RESOLUTION=${RESOLUTION:-highest}
 
 passed='' failed='' missing=''
 for python in $PYTHONS; do
