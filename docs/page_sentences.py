@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import page_tables as tables
 
@@ -35,15 +37,20 @@ def readme():
     yield f"| `make test` | {run['tests_s'] / 60:.1f} min | | |"
     yield f"took {run['cpu_s'] / 60:.1f} min of CPU time"
     yield f"trainings of the DAE {training_s / 60:.1f} min of it"
+    project = tomllib.loads((tables.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    python = project["requires-python"].removeprefix(">=")
+    yield f"in a virtual environment of Python {python} or newer is enough"
     # One dataset, next to the paper's table.
-    table = tables.read_record("tables/dataset3_mse.csv").set_index(["source", "reference"])[
-        "0.003"
-    ]
+    level = "0.003"
+    table = tables.read_record("tables/dataset3_mse.csv").set_index(["source", "reference"])[level]
+    yield f"| MSE at λ = {level} | noisy | PCA+SOM | DAE |"
     yield f"| paper | {' | '.join(f'{v:.2e}' for v in table['paper', 'as published'])} |"
     yield f"| psfdae | {' | '.join(f'{v:.2e}' for v in table['psfdae', 'realisation'])} |"
     # A sweep, and the runs as MLflow shows them.
     points = tables.read_record("sweeps/network_epochs/summary.csv")
     points = points.sort_values("train_noise_trained.epochs")
+    epochs = points["train_noise_trained.epochs"].unique()
+    yield f"| mean absolute error after | {' | '.join(map(str, epochs))} epochs |"
     for name, label in (("perceptron", "perceptron"), ("cnn", "CNN")):
         errors = points[points.network == name].validation_mae
         yield f"| {label} | {' | '.join(f'{v:.4f}' for v in errors)} |"

@@ -29,6 +29,16 @@ def test_numbers_in_sentences_are_those_of_the_tables(page):
     assert expected and [sentence for sentence in expected if sentence not in text] == []
 
 
+def test_every_number_in_the_prose_of_the_readme_is_in_such_a_sentence():
+    text = " ".join(re.sub(r"^```.*?^```", "", read("README.md"), flags=re.M | re.S).split())
+    for sentence in sentences.SENTENCES["README.md"]():
+        text = text.replace(" ".join(sentence.split()), "")
+    # The year of the paper, numbers of scenes, the S/N of a picture, and powers of ten are left;
+    # the number in a name, such as AVX-512, is none.
+    assert {*re.findall(r"(?<![\w-])\d+(?:[.,]\d+)*", text)} <= {"1", "2", "3", "10", "2020"}
+    assert not re.search(r"\b(twice|(two|three|four|five|six|ten) (to \w+ )?times)\b", text)
+
+
 def test_every_table_of_a_page_has_rows_and_every_function_a_page():
     page_of_table = {}
     for page in pages():
