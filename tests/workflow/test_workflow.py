@@ -240,7 +240,7 @@ def test_a_dataset_that_changes_its_shared_telescope_stops_before_any_job(tree, 
     )
     (tree / "config/dataset/dataset9.yaml").write_text(text, encoding="utf-8")
     out = snakemake(tmp_path, "dataset9", root=tree, check=False)
-    assert "dataset=dataset9: telescope.obscuration = 0.1, but its stars are those of" in out
+    assert "dataset=dataset9: telescope.obscuration = 0.1, but its stars are simulated by" in out
     assert not (tmp_path / "results").exists()
 
 

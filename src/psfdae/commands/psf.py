@@ -143,7 +143,7 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
         notes.append(
             f"{outside_count} of {len(positions)} places are beyond the training stars, "
             f"x {low[0]:.6g} … {high[0]:.6g}, y {low[1]:.6g} … {high[1]:.6g}; the PSF there is "
-            "that of their edge"
+            "the PSF at their edge"
         )
     # A PSF that does not change over the field makes many places useless.
     if order == 0 and len(positions) > 1:

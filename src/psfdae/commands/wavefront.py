@@ -106,7 +106,7 @@ def wavefront_command(
         f"χ² {np.nanmedian(wavefronts.chi2):.2f} median"
     )
     if failures > 0.1 * count:
-        summary += ": the telescope, its seeing or the prior are not those of the image"
+        summary += ": the telescope, its seeing or the prior do not fit the image"
     print("\n".join([*lines, summary]))
 
 
@@ -161,8 +161,8 @@ def check_scale(observation: Observation, telescope: OwnTelescope) -> None:
     # "not <=" refuses a scale that is not a number, too.
     if scale is not None and not abs(scale / telescope_scale - 1.0) <= SCALE_TOLERANCE:
         raise SensingError(
-            f"{observation.path}: pixels of {scale:.6g} arcsec, but those of the telescope "
-            f"{telescope.name!r} are {telescope_scale:.6g} arcsec (tolerance "
+            f"{observation.path}: pixels of {scale:.6g} arcsec, but the telescope "
+            f"{telescope.name!r} has {telescope_scale:.6g} arcsec (tolerance "
             f"{100 * SCALE_TOLERANCE:g} %)"
         )
 

@@ -460,9 +460,9 @@ class FieldDenoiser(Denoiser):
         if self.wings is None:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
-        place = np.stack([stars.x, stars.y], axis=1)
+        position = np.stack([stars.x, stars.y], axis=1)
         # A wider PSF has more light beyond its stamp.
-        outer_part = outer_shares(self.method.psf_at, place, flux)
+        outer_part = outer_shares(self.method.psf_at, position, flux)
         factor, factor_error = self.wings.total_over_flux(outer_part)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
@@ -494,17 +494,17 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     # Stamps above the level of their border; the sky that is measured counts from it, too.
     data, noise, is_unusable = centred_stars.measurable()
     has_flux = np.isfinite(stars.flux)
-    # Place, magnitude and colour, on which the PSF depends; a star without a listed magnitude has
-    # the magnitude of its flux.
+    # Position, magnitude and colour, on which the PSF depends; a star without a listed magnitude
+    # has the magnitude of its flux.
     flux = np.where(has_flux, stars.flux, photometry.flux)
     star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
-    place = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
+    position = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
     # PSF, flux, sky and centre at once; given values are taken unchanged. Centres count from the
     # middle of the stamp, which was moved.
     estimate = method.measure(
         data,
         noise,
-        place,
+        position,
         stars.listed - centred_stars.shift,
         centred_stars.has_exact_centre,
         flux=stars.flux,
@@ -514,7 +514,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     # Errors of the method, by noise, and errors of the PSF model add up: C = C_noise + C_model.
     star_fit = estimate.measurements
     assert star_fit is not None and estimate.sigma is not None
-    covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, place[:, :2])
+    covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, position[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
     # A flux that was given counts if the photometry could use it, another one above its error.
     flux = np.where(has_flux, stars.flux, star_fit.flux)
@@ -525,7 +525,7 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
     is_measured = ~has_flux & ~has_no_flux
     raise_flag(flags, StarFlag.FAINT, is_measured & is_faint(flux, flux_error))
-    raise_flag(flags, StarFlag.BEYOND, method.is_outside_range(place) & ~has_no_flux)
+    raise_flag(flags, StarFlag.BEYOND, method.is_outside_range(position) & ~has_no_flux)
     # The same photometry with the method's fluxes and skies: images are (x − b) / F.
     unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
     images = (data - star_fit.background[:, None, None]) / unit

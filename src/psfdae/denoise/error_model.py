@@ -56,7 +56,7 @@ class ModelErrors(NamedTuple):
     middle : ndarray, shape (2,)
         Place (x₀, y₀) in the image from which the variance of a flux grows.
     growth : ndarray, shape (4,)
-        Coefficients (a, b, c, d): the variance of a flux at the place (x, y) is v = a + b u² +
+        Coefficients (a, b, c, d): the variance of a flux at the position (x, y) is v = a + b u² +
         c w² + d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By
         default it is the same at all places. Errors of sky and centre grow alike.
     """
@@ -68,18 +68,18 @@ class ModelErrors(NamedTuple):
     middle: np.ndarray = np.zeros(2)
     growth: np.ndarray = np.eye(4)[0]
 
-    def flux_factor(self, place: np.ndarray) -> np.ndarray:
+    def flux_factor(self, position: np.ndarray) -> np.ndarray:
         """Return √v: errors of fluxes at (n, 2) positions x, y, over the RMS of the field, (n,).
 
-        1 where the place is not known (NaN).
+        1 where the position is not known (NaN).
         """
         # v = (a, b, c, d) · (1, u², w², u² w²).
-        u2, w2 = np.square(place - self.middle).T
-        terms = np.stack([np.ones(len(place)), u2, w2, u2 * w2])
+        u2, w2 = np.square(position - self.middle).T
+        terms = np.stack([np.ones(len(position)), u2, w2, u2 * w2])
         return np.where(np.isfinite(u2 + w2), np.sqrt(self.growth @ terms), 1.0)
 
     def add_to_covariance(
-        self, covariance: np.ndarray, flux: np.ndarray, place: np.ndarray
+        self, covariance: np.ndarray, flux: np.ndarray, position: np.ndarray
     ) -> np.ndarray:
         """Return covariances of measured stars with the errors of the model too.
 
@@ -89,7 +89,7 @@ class ModelErrors(NamedTuple):
             Covariance of flux, sky, row and column, due to noise.
         flux : ndarray, shape (n,)
             Fluxes of the stars; negative ones count as 0.
-        place : ndarray, shape (n, 2)
+        position : ndarray, shape (n, 2)
             Place x and y in the image; NaN where unknown.
 
         Returns
@@ -100,7 +100,7 @@ class ModelErrors(NamedTuple):
         # Standard errors by the model: errors of flux and sky grow with the flux.
         unit, zeros = np.maximum(flux, 0.0)[:, None], np.zeros((len(flux), 2))
         model_sigma = np.concatenate([unit * [self.flux, self.sky], zeros + self.centre], axis=1)
-        model_sigma *= self.flux_factor(place)[:, None]
+        model_sigma *= self.flux_factor(position)[:, None]
         # A method that is given a number returns it with a σ far below any that noise makes.
         variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
         known_sigma = np.concatenate([unit * 1e-5, unit * 1e-12, zeros + 1e-9], axis=1)

@@ -74,7 +74,7 @@ def make_stamps(
                 number = value.to_value(stamp_unit)
             except (ValueError, TypeError):
                 raise PredictionError(
-                    f"{name} in {value.unit}, but that of the stamps is {stamp_unit}"
+                    f"{name} in {value.unit}, expected {stamp_unit} as the stamps"
                 ) from None
         number = real_numbers(name, number, PredictionError)
         if number.shape not in ((), (count,)):

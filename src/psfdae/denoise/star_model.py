@@ -78,7 +78,7 @@ class StarModel(FieldPsfs):
         if path is not None and Path(path).suffix in (".yaml", ".yml"):
             wavefront = call("psfdae.wavefront", f"psfdae wavefront INPUT --telescope {path}")
             raise PredictionError(
-                f"{path}: describes a telescope, and is no model; {wavefront} measures the "
+                f"{path}: describes a telescope, not a model; {wavefront} measures the "
                 "wavefronts of its stars, and gives their PSFs"
             )
         return cls(read_bundle(None if path is None else Path(path)))
@@ -252,7 +252,7 @@ class StarModel(FieldPsfs):
         """Light of stars beyond their stamps, if the bundle says any."""
         return self.denoiser.wings
 
-    def flux_error(self, place: np.ndarray) -> np.ndarray:
+    def flux_error(self, position: np.ndarray) -> np.ndarray:
         """Return the relative flux errors of stars at positions (n, 2), x and y, due to the PSF.
 
         Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
@@ -260,7 +260,7 @@ class StarModel(FieldPsfs):
         errors there as well, which no field knows.
         """
         errors = self.bundle.errors.model
-        return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(place), 1.0))
+        return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(position), 1.0))
 
     @property
     def image_px(self) -> tuple[int, int] | None:
@@ -273,9 +273,9 @@ class StarModel(FieldPsfs):
         self._field()
         # The field's polynomial has its range in its arrays.
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
-        # Stars without places leave zeros; a star alone is at one place.
+        # Stars without positions leave zeros; a star alone is at one position.
         if not ((high > low) | ((high == low) & (low != 0))).all():
-            raise PredictionError(f"the model {self.name!r} knows no places of its stars")
+            raise PredictionError(f"the model {self.name!r} knows no positions of its stars")
         return low, high
 
     @property
@@ -285,13 +285,13 @@ class StarModel(FieldPsfs):
         return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
 
     def _field(self) -> Method:
-        """Return the method as one that knows the PSF at every place of the field."""
+        """Return the method as one that knows the PSF at every position in the field."""
         field = self.method
         if not field.knows_field:
             training = call("psfdae.fit with method='field'", "psfdae train --method field")
             raise PredictionError(
                 f"the model {self.name!r}: {field.look.title}: knows the PSF of a star alone, "
-                f"not that of a place; {training} makes one that does"
+                f"not the PSF of a position; {training} makes one that does"
             )
         return field
 
@@ -306,9 +306,9 @@ class StarModel(FieldPsfs):
         middle = slice(max(begin, 0), begin + side_px)
         return float(variance[middle, middle].mean())
 
-    def draw_psfs(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+    def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
         """Return the PSFs of flux 1 at positions (n, 2 to 4), as `FieldPsfs` defines it."""
-        return self._field().psf_at(place, oversampling)
+        return self._field().psf_at(position, oversampling)
 
     def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
         """Return the model in the pixel frame of an image, and notes on how frames differ."""
@@ -327,8 +327,8 @@ class StarModel(FieldPsfs):
             return self, []
         words = "{}×{} pixels, {}×{} in the training".format(*sizes[0], *sizes[1])
         if offset is None:
-            place = "headers do not show which part it is: positions are used as in the training"
-            return self, [f"{observation.path}: {words}; {place}"]
+            advice = "headers do not show which part it is: positions are used as in the training"
+            return self, [f"{observation.path}: {words}; {advice}"]
         # Positions of a model are the range of its field, and the middle from which errors grow.
         bundle, weights = self.bundle, dict(self.bundle.weights)
         for name in ("low", "high"):
@@ -339,8 +339,8 @@ class StarModel(FieldPsfs):
         shifted_bundle = replace(bundle, weights=weights, errors=errors)
         # Results name the file of the model.
         vars(shifted_bundle)["sha256"] = bundle.sha256
-        place = "by the headers, its first pixel is x {:g}, y {:g} there".format(*offset)
-        return type(self)(shifted_bundle), [f"{observation.path}: {words}; {place}"]
+        frame = "by the headers, its first pixel is x {:g}, y {:g} there".format(*offset)
+        return type(self)(shifted_bundle), [f"{observation.path}: {words}; {frame}"]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Raise an error if the pixels of stars differ in scale from the training stars.

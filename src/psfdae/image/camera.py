@@ -450,8 +450,8 @@ def sky_coordinate_remarks(image: ImageFile) -> list[str]:
     if image.wcs is None and names & {"RA", "DEC", "GLON", "GLAT", "ELON", "ELAT"}:
         return [
             f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used, or its sky "
-            "axes are not those of the pixels: no sky coordinates, and the pixel scale is that of "
-            "other keys"
+            "axes are not the axes of the pixels: no sky coordinates, and the pixel scale is read "
+            "from other keys"
         ]
     # astropy applies a polynomial that the projection does not announce.
     has_polynomial = image.wcs is not None and image.wcs.sip is not None

@@ -104,8 +104,8 @@ def sky_level(
         noise *= correlation
         notes.append(
             "pixels share their noise, as neighbours of resampled images do, or rows or columns "
-            f"with offsets: that of sums of pixels is {correlation:.2f} times as large, and errors "
-            "are of sums"
+            f"with offsets: the noise of sums of pixels is {correlation:.2f} times as large, and "
+            "errors are of sums"
         )
     return SkyLevel(level, noise, structure._replace(is_fine=share > 0), tuple(notes))
 

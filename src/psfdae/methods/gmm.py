@@ -83,7 +83,7 @@ class GaussianMixture(MixturePrior, Method):
             "variance_reference": ("1", "variance of references within clusters"),
             "whitening": ("1", "to positions of unit variance within clusters"),
             "center": ("1", "mean whitened position of each cluster"),
-            "deviation_center": ("1", "whitened positions less that of their cluster"),
+            "deviation_center": ("1", "whitened positions less the position of their cluster"),
             "slope": ("1", "common change of images (in the axes) with whitened position"),
             "slope_reference": ("1", "common change of references with whitened position"),
             "shrinkage": ("1", "stars that the common covariance counts for"),

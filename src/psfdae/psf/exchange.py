@@ -129,7 +129,7 @@ class GridField(FieldFile):
         # Detectors side by side, each with PSFs at its edge: positions in an image are of one.
         nodes = [np.unique(axis) for axis in positions.T]
         if any((np.diff(axis) <= 1).any() for axis in nodes):
-            self._refuse("PSFs of several detectors, expected those of one")
+            self._refuse("PSFs of several detectors, expected one")
         self.order = min(3, max(map(len, nodes)) - 1)
         # Stamps are as large as the sampled images, rounded down to an even number of pixels.
         self.stamp_px = 2 * int(min(psfs.shape[1:]) / oversampling / 2)
@@ -254,7 +254,7 @@ class PsfexField(FieldFile):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the range of positions (x, y) that PSFEx scaled; PredictionError if unknown."""
         if (self.width <= self.unknown_width_px).any():
-            raise PredictionError(f"the model {self.name!r} knows no places of its stars")
+            raise PredictionError(f"the model {self.name!r} knows no positions of its stars")
         return self.zero - self.width / 2, self.zero + self.width / 2
 
     def interpolate(self, position: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:

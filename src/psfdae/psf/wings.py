@@ -79,7 +79,7 @@ class Wings:
             light, light_sigma = wings.light() if is_rising else (np.nan, np.nan)
         is_scaled = 0.0 < wings.outer_share < np.inf
         if not (is_scaled and abs(light) < 10.0 and np.isfinite(light_sigma)):
-            raise ValueError("wings whose light is no part of that of a star")
+            raise ValueError("wings whose light is not a fraction of a star's")
         return wings
 
     def plain(self) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class Wings:
         if light / (1.0 + light) > 0.2:
             sentence += (
                 f"; over a fifth of the flux: try wider stamps ({keyword('stamp_px')}), or a list "
-                "without sources that are no stars"
+                "without sources other than stars"
             )
         return sentence
 

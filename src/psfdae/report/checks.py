@@ -103,9 +103,9 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     # The S/N nearest to 10 stands for faint stars, for which models differ most.
     mean, linear = (mse_ratios(errors, method, name) for name in (MEAN_PSF, "lmmse"))
     snr = nearest_snr(mean)
-    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times that of one mean PSF"
+    sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times the MSE of one mean PSF"
     if linear and method != "lmmse":
-        sentence += f", {linear[snr]:.2f} times that of linear MMSE"
+        sentence += f", {linear[snr]:.2f} times the MSE of linear MMSE"
     levels = ", ".join(f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1)
     verdict = f"no better than the mean PSF at S/N {levels}" if levels else "better at each S/N"
     return f"{sentence}; {verdict} ({errors['stars'][0]} stars held out)"

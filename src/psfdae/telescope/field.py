@@ -100,7 +100,7 @@ def static_zernikes(
         # Polynomials of the field.
         field = relative_field(telescope, angle_deg)
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
-    assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
+    assert isinstance(aberrations, Raytraced), "Seidel aberrations have no Zernike terms"
     # Ray trace of the telescope of the file.
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
     defocus_m, misalignment = aberrations.defocus_m, aberrations.misalignment

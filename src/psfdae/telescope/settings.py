@@ -64,7 +64,7 @@ class Seeing(Group):
         if (self.kind == "moffat") != (self.beta is not None):
             raise ValueError(
                 f"beta = {self.beta}: must be between 1.5 and 20 for kind = moffat, "
-                "and is no key of kind = gaussian"
+                "and must be absent for kind = gaussian"
             )
         return self
 

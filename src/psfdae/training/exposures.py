@@ -67,8 +67,8 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     # How much an exposure may change is judged from the field of the training.
     if info.adapted:
         raise PredictionError(
-            f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
-            "exposure it was trained on"
+            f"the model {model.name!r} was itself adapted to {info.adapted}; expected the model "
+            "of the exposure it was trained on"
         )
     settings = read_training_settings(model)
     # Its bright stars, chosen as in the training, but few are enough.

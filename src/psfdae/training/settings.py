@@ -131,7 +131,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
-            raise ConfigError(f"{word}: {text!r} is no value") from None
+            raise ConfigError(f"{word}: {text!r} is not a valid YAML value") from None
         tree[group] = value if is_group else {**tree.get(group, {}), name: value}
     return parse_settings(settings_model(), tree)
 

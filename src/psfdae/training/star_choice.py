@@ -71,7 +71,7 @@ def choose_bright_stars(
     )
     if least_snr < stated_snr:
         notes.append(
-            f"few stars: those of S/N {least_snr:g} and above are used, because fewer than 20 have "
+            f"few stars: stars of S/N {least_snr:g} and above are used, because fewer than 20 have "
             f"S/N {stated_snr:g}; {keyword('snr_min')} sets another limit"
         )
     return observations, candidates, relaxed_settings, notes
@@ -303,7 +303,9 @@ def require_unique_names(sources: Sequence[ImageInput]) -> None:
     names = [source.name for source in sources]
     for number, name in enumerate(names):
         if (first := names.index(name)) < number:
-            problem = f"its model would have the name of that of {sources[first].path}, {name!r}"
+            problem = (
+                f"its model and the model of {sources[first].path} would both be called {name!r}"
+            )
             raise ObservationError(sources[number].path, problem)
 
 
@@ -340,5 +342,5 @@ def require_one_camera(observations: Sequence[Observation]) -> None:
             name, (first_text, text) = "the part of the detector", map(str, parts)
         else:
             continue
-        problem = f"{name} is {text}, but that of {first.path} is {first_text}; a model is of one"
+        problem = f"{name} is {text}, in {first.path} {first_text}; a model needs images of one"
         raise ObservationError(observation.path, problem)

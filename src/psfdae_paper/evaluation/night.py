@@ -46,7 +46,7 @@ PLAIN_NUMBER = r"(-?(0|[1-9][0-9]*)(\.[0-9]+)?)?"
 LIMITS = {
     "fwhm_px_centre": (
         0.5,
-        "stars of {value:.2f} px, those of its neighbours in time {median:.2f}",
+        "FWHM {value:.2f} px, median of its neighbours in time {median:.2f} px",
     ),
     "ellipticity_centre": (0.1, "elongated stars, ellipticity {value:.2f}: trailed?"),
     "mag_20th": (0.5, "stars fainter by {excess:.1f} mag than in its neighbours in time: clouds?"),

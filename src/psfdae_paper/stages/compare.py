@@ -213,8 +213,8 @@ def warn_about_sizes(sizes: Iterable[tuple[str, object, object]]) -> list[str]:
     """
     differences = [f"{name} {first} (A), {second} (B)" for name, first, second in sizes]
     return [
-        "> **NOT COMPARABLE: the runs have other numbers of stars**, as those of the preset smoke "
-        f"and of a full run have: {'; '.join(differences)}."
+        "> **NOT COMPARABLE: the runs have different numbers of stars**, as a run of the preset "
+        f"smoke and a full run do: {'; '.join(differences)}."
     ][: len(differences)]
 
 

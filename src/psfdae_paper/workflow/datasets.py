@@ -143,7 +143,7 @@ def stars_file(run: Run, dataset: str) -> str:
         # The first difference ends the program; one is enough for the user to see the cause.
         for key, value, star_value in compare_simulations(tree, compose_choice(run, choice)):
             raise ConfigError(
-                f"dataset={dataset}: {key} = {value}, but its stars are those of {choice} with "
+                f"dataset={dataset}: {key} = {value}, but its stars are simulated by {choice} with "
                 f"{star_value}; {advice}"
             )
     return f"{run.results}/data/{config.scene.name}/{name}.h5"

@@ -98,4 +98,4 @@ def test_a_third_axis_does_not_move_the_sky(tmp_path, axes, planes):
         columns = observation.sky_columns(*place.T)
         np.testing.assert_allclose([*columns.values()], (sky.ra.deg, sky.dec.deg))
     else:
-        assert observation.wcs is None and "not those of the pixels" in observation.summary()
+        assert observation.wcs is None and "not the axes of the pixels" in observation.summary()

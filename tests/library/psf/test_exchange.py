@@ -261,7 +261,7 @@ def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
     back = load_field(tmp_path / "m.psf")
     assert back.order == 0
     assert back.psf_at(500.0, 500.0, 2) == pytest.approx(Moving().psf_at(*LOW, 2), abs=1e-5)
-    with pytest.raises(PredictionError, match="knows no places"):
+    with pytest.raises(PredictionError, match="knows no positions"):
         back.field_range()
 
 

@@ -66,8 +66,8 @@ def test_standing_says_where_a_model_is_worse():
     good, poor = errors((2e-6, 1e-6)), errors((2e-6, 4.4e-6))
     assert mse_ratios(good, "gmm", MEAN_PSF) == {10.0: 0.5, 50.0: 0.25}
     sentence = comparison_sentence(good, "gmm", "mixture")
-    assert "0.50 times that of one mean PSF" in sentence
-    assert "0.40 times that of linear MMSE" in sentence and "40 stars held out" in sentence
+    assert "0.50 times the MSE of one mean PSF" in sentence
+    assert "0.40 times the MSE of linear MMSE" in sentence and "40 stars held out" in sentence
     assert "no better than the mean PSF at S/N 50 (" in comparison_sentence(poor, "gmm", "mixture")
     assert "linear" not in comparison_sentence(good[good["method"] != "lmmse"], "gmm", "mixture")
 

@@ -336,7 +336,7 @@ def solve_splines(
     terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
     rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
 
-    def normal(flat: np.ndarray) -> np.ndarray:
+    def multiply_normal(flat: np.ndarray) -> np.ndarray:
         # T c, then Tᵀ w T c, then half of the gradient of the penalties.
         c = flat.reshape(shape)
         fields = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
@@ -347,24 +347,26 @@ def solve_splines(
 
     projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
     # Preconditioner: the terms of a knot are solved together, as they are far from orthogonal.
-    # Knots are treated as independent: the diagonals of RᵀwC and of B, which is 6 inside.
+    # Knots are treated as independent: the diagonal of RᵀwC, and half of
+    # the diagonal of c ↦ B c + c B, which is 12 inside: with 12 itself, fits of a field took 3.6 %
+    # more iterations.
     curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
     pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
     blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
     blocks += np.eye(shape[0]) * (6 * penalty.ravel() + ridge.reshape(shape[0], -1).T)[:, None, :]
     inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
 
-    def nearly(flat: np.ndarray) -> np.ndarray:
+    def precondition(flat: np.ndarray) -> np.ndarray:
         # The terms of each knot by the inverse of its block.
         return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
 
     coefficients, _ = cg(
-        LinearOperator(size, matvec=normal, dtype=float),
+        LinearOperator(size, matvec=multiply_normal, dtype=float),
         (terms.T @ projection).ravel(),
         None if start is None else start.ravel(),
         rtol=tolerance,
         maxiter=150,
-        M=LinearOperator(size, matvec=nearly, dtype=float),
+        M=LinearOperator(size, matvec=precondition, dtype=float),
     )
     return np.asarray(coefficients).reshape(shape)
 
