@@ -35,6 +35,26 @@ ESTIMATORS = {
 """Estimators of scene 3 that the pages show."""
 
 
+HEADINGS = {
+    "noisy": "noisy",
+    "mean_psf": "one mean PSF",
+    "pca_som": "PCA+SOM",
+    "lmmse": "linear MMSE",
+    "dae": "DAE",
+    "gmm": "mixture",
+    "gmm_position": "mixture with field position",
+    "field": "field",
+}
+"""Headings of the columns of methods."""
+LEVEL = {"dataset": "{dataset}", "λ": "{noise_level}"}
+"""Columns that name a noise level."""
+
+
+def method_columns(form: str, names: str) -> dict[str, str]:
+    """Return a column for each of some methods, in one format, such as `{:.2e}`."""
+    return {HEADINGS[name]: form.replace("{", "{" + name) for name in names.split()}
+
+
 def read_record(name: str) -> pd.DataFrame:
     """Read a table of the run of record."""
     return pd.read_csv(RECORD / name)
@@ -110,9 +130,7 @@ def errors(name: str = "tables/psf_metrics.csv") -> pd.DataFrame:
 def paper_preset() -> pd.DataFrame:
     """Errors with the paper's hyper-parameters in dataset 3."""
     table = errors("paper/tables/psf_metrics.csv").query("dataset == 'dataset3'")
-    return formatted(
-        table, **{"λ": "{noise_level}", "PCA+SOM": "{pca_som:.2e}", "DAE": "{dae:.2e}"}
-    )
+    return formatted(table, **{"λ": "{noise_level}", **method_columns("{:.2e}", "pca_som dae")})
 
 
 def all_errors() -> pd.DataFrame:
@@ -120,14 +138,8 @@ def all_errors() -> pd.DataFrame:
     table = errors().query("dataset in ['dataset3', 'dataset5', 'dataset8']")
     return formatted(
         table,
-        dataset="{dataset}",
-        λ="{noise_level}",
-        noisy="{noisy:.2e}",
-        **{"PCA+SOM": "{pca_som:.2e}"},
-        linear_MMSE="{lmmse:.2e}",
-        DAE="{dae:.2e}",
-        mixture="{gmm:.2e}",
-        mixture_with_field_position="{gmm_position:.2e}",
+        **LEVEL,
+        **method_columns("{:.2e}", "noisy pca_som lmmse dae gmm gmm_position"),
     )
 
 
@@ -141,8 +153,7 @@ def optics() -> pd.DataFrame:
     both = free.merge(given, on=keys, suffixes=("", "_given")).sort_values(keys)
     return formatted(
         both.query("dataset in ['dataset3', 'dataset4', 'dataset5']"),
-        dataset="{dataset}",
-        λ="{noise_level}",
+        **LEVEL,
         optics="{mse:.2e}",
         over_the_bound="{ratio:.2f}{mark}",
         field_given="{mse_given:.2e}",
@@ -157,8 +168,7 @@ def denoisers() -> pd.DataFrame:
     keys = ["dataset", "noise_level"]
     return formatted(
         rows.pivot(index=keys, columns="method", values="mse").reset_index(),
-        dataset="{dataset}",
-        λ="{noise_level}",
+        **LEVEL,
         wavelets="{wavelet:.2e}",
         **{"non-local means": "{nl_means:.2e}"},
         total_variation="{tv:.2e}",
@@ -174,10 +184,7 @@ def seed_scatters() -> pd.DataFrame:
         table.query("dataset in ['dataset3', 'dataset5', 'dataset8']"),
         dataset="{dataset}",
         reference="{reference}",
-        DAE="{dae:.1f} %",
-        **{"PCA+SOM": "{pca_som:.1f} %"},
-        mixture="{gmm:.1f} %",
-        mixture_with_field_position="{gmm_position:.1f} %",
+        **method_columns("{:.1f} %", "dae pca_som gmm gmm_position"),
     )
 
 
@@ -309,12 +316,7 @@ def own_stars() -> pd.DataFrame:
     return formatted(
         wide.reset_index(),
         **{"S/N": "{snr:.3g}"},
-        noisy="{noisy}",
-        one_mean_PSF="{mean_psf}",
-        linear_MMSE="{lmmse}",
-        DAE="{dae}",
-        mixture="{gmm}",
-        field="{field}",
+        **method_columns("{}", "noisy mean_psf lmmse dae gmm field"),
     )
 
 
@@ -478,8 +480,7 @@ def paper_rows() -> pd.DataFrame:
     table = read_record("tables/paper_rows.csv").query("method == 'dae' and dataset != 'dataset5'")
     return formatted(
         table,
-        dataset="{dataset}",
-        λ="{noise_level}",
+        **LEVEL,
         paper="{mse_paper:.2e}",
         ours="{mse:.2e}",
         posterior_mean="{mse_bound:.2e} ± {stderr:.0e}",
@@ -500,8 +501,7 @@ def posterior_means() -> pd.DataFrame:
     table = free.merge(given, on=keys, suffixes=("", "_given"))
     return formatted(
         table.merge(floor[[*keys, "value"]], on=keys, suffixes=("", "_floor")),
-        dataset="{dataset}",
-        λ="{noise_level}",
+        **LEVEL,
         posterior_mean="{value:.2e} ± {stderr:.0e}",
         posterior_variance="{variance:.2e}",
         calibration="{calibration:+.1f}",
@@ -524,14 +524,8 @@ def efficiencies() -> pd.DataFrame:
     table = rows.groupby([*keys, "method"]).cell.agg(" ".join).unstack(fill_value="")
     return formatted(
         table.reset_index(),
-        dataset="{dataset}",
-        λ="{noise_level}",
-        noisy="{noisy}",
-        **{"PCA+SOM": "{pca_som}"},
-        linear_MMSE="{lmmse}",
-        DAE="{dae}",
-        mixture="{gmm}",
-        mixture_with_field_position="{gmm_position}",
+        **LEVEL,
+        **method_columns("{}", "noisy pca_som lmmse dae gmm gmm_position"),
     )
 
 
