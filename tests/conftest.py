@@ -14,6 +14,7 @@ from job_server import job_server
 from prediction_stars import fresh_psfs, gaussians, with_network
 from psfdae import load_model
 from psfdae.api import PsfModel
+from psfdae.denoise.bundle import read_bundle
 from psfdae.optics.pupil import annular_pupil
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.alignment.stamps import AlignmentStamps
@@ -199,13 +200,12 @@ def training(shared_folder):
 @pytest.fixture
 def site(tmp_path, empty_database, monkeypatch):
     """A results folder with its own copy of the database."""
-    from psfdae_paper import registry
+    from psfdae_paper import tracking
 
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     # The stage sets these; setenv makes pytest restore them.
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    monkeypatch.setattr(registry, "make_bundle", lambda *arguments: None)
-    monkeypatch.setattr(registry, "write_bundle", lambda bundle, path: path.write_text("bundle"))
+    monkeypatch.setattr(tracking, "make_bundle", lambda *arguments: read_bundle())
     return Site(tmp_path, empty_database)

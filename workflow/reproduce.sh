@@ -5,7 +5,7 @@ set -feu
 
 case "$TRACK" in
     '') ;;
-    live) export PSFDAE_EPOCHS=psfdae_paper.stages.live:logger ;;
+    live) export PSFDAE_EPOCHS=psfdae_paper.stages.track:logger ;;
     *) echo "TRACK=$TRACK: live, or nothing"; exit 2 ;;
 esac
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.

@@ -1,7 +1,7 @@
-"""Runs as MLflow shows them, read from the files in the results folder.
+"""Runs of the results folder for MLflow: tables in, runs out.
 
-Each `TrackedRun` names its files, settings and metrics in the results folder. This module does not
-use MLflow's database.
+A `TrackedRun` names the tables, settings and files of a method, a network, an image or a sweep in
+the results folder. This module does not use MLflow's database.
 """
 
 from __future__ import annotations
@@ -9,38 +9,32 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import starmap
+from functools import cached_property, partial
 from pathlib import Path
-from statistics import fmean
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
 from psfdae.base.belonging import STARS, require_origin
 from psfdae.base.files import ProductError, compute_sha256, read_product
 from psfdae.base.reading import from_tree, read_json, read_table, read_yaml
 from psfdae.base.settings import leaves
-from psfdae.denoise.bundle import SUFFIX
+from psfdae.denoise.bundle import SUFFIX, Bundle, read_bundle
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
-from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.methods.interface import CONFIG, HISTORY, Method
-from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.compose import list_datasets, load
-from psfdae_paper.configuration.estimators import (
-    ESTIMATORS,
-    Estimator,
-    list_swept_networks,
-    list_trained_networks,
-)
-from psfdae_paper.configuration.methods import list_methods
+from psfdae.training.packing import build_uncalibrated
+from psfdae.training.star_sets import read_stars
+from psfdae_paper.configuration import estimators
+from psfdae_paper.configuration.compose import part
 from psfdae_paper.evaluation.night import read_night
 from psfdae_paper.sweeps.points import compute_hash
 
-if TYPE_CHECKING:
-    from mlflow.entities import Metric
+TASK = ("seed", "noise", "parts")
+"""Groups of settings that decide with which stars and noise a method is trained and tested."""
+
+KEY = ("kind", "dataset", "split", "reference")
+"""Names of method, stars, split and reference of a run."""
 
 
 @dataclass(frozen=True)
@@ -49,37 +43,34 @@ class TrackedRun:
 
     Attributes
     ----------
-    kind, dataset, split, reference : str
-        Method, or kind of network; name of the stars; split and reference of the training.
+    root : Path
+        Folder of the results, which has all files of the run.
+    experiment : str
+        Name of MLflow's experiment.
     source : str
-        Path of the model below the results folder, which distinguishes runs that agree in
-        everything else.
-    name, experiment : str
-        Name of the run, and of MLflow's experiment that holds it.
-    files : mapping of str to Path
-        Files by their names within the run; names of model files begin with `model_prefix`.
+        Path below `root` that distinguishes runs which agree in everything else.
+    key : tuple of four str
+        Method, or kind of network; name of the stars; split and reference of the training (`KEY`).
     config : mapping
-        Configuration of the training and of its stars.
-    last_file : Path or None
-        File that the run has written last; None while it runs.
+        Settings of the training and of its stars.
+    fit_files : sequence of Path
+        Files of the model or of the result; the first one was written last.
+    files : sequence of Path
+        Tables and figures. A history has a row for each epoch.
     metrics : mapping of str to float
-        Metrics of the finished run; the name of one at a noise level ends in it.
-    epochs : sequence of mappings
-        Rows of the training history.
-    seconds : float or None
-        Duration of the job that made the run; by default the time up to the last epoch.
-    status : str
-        Status in MLflow.
+        Metrics of the finished run, by the names that tables give them.
+    job : str
+        Path of the cost of the job that made the run, a table of Snakemake below `root`.
+    name : str
+        Name of the run, by default its key.
     parent : str
         Source of the run that this one is a part of, which is imported before it.
     tags : mapping of str to str
         Tags that not all runs have.
     data : Path or None
-        Product with the training data.
-    fit : tuple of a type of Method and a Path, or None
-        Fit that a model bundle can hold, and its folder or file.
-    averaged : tuple of str
-        Metrics whose means over the noise levels are also metrics of a run.
+        Product with the training data, if there is one.
+    bundle : callable or None
+        Function that returns the model bundle of the run; None if no bundle can hold its model.
 
     Raises
     ------
@@ -87,42 +78,27 @@ class TrackedRun:
         If a file is missing.
     """
 
-    model_prefix: ClassVar = "model/"
-    averaged_metrics: ClassVar = ("mse", "ssim")
-
-    kind: str
-    dataset: str
-    split: str
-    reference: str
-    source: str
-    name: str
+    root: Path
     experiment: str
-    files: Mapping[str, Path] = field(default_factory=dict)
-    config: Mapping[str, Any] = field(default_factory=dict)
-    last_file: Path | None = None
+    source: str
+    key: tuple[str, ...]
+    config: Mapping[str, Any]
+    fit_files: Sequence[Path]
+    files: Sequence[Path] = ()
     metrics: Mapping[str, float] = field(default_factory=dict)
-    epochs: Sequence[Mapping[str, float]] = ()
-    seconds: float | None = None
-    status: str = "FINISHED"
+    job: str = ""
+    name: str = ""
     parent: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
     data: Path | None = None
-    fit: tuple[type[Method], Path] | None = None
+    bundle: Callable[[], Bundle] | None = None
 
     def __post_init__(self) -> None:
         """Require all files: a run is read as a whole or not at all."""
-        for path in (*self.files.values(), self.last_file):
-            if path is not None and not path.is_file():
+        for path in (*self.fit_files, *self.files):
+            if not path.is_file():
                 raise ProductError(f"{path}: no such file")
-
-    @property
-    def model_files(self) -> dict[str, Path]:
-        """Files of the model by their names without the prefix; none for a sweep as a whole."""
-        return {
-            name.removeprefix(self.model_prefix): path
-            for name, path in self.files.items()
-            if name.startswith(self.model_prefix)
-        }
+        object.__setattr__(self, "name", self.name or " ".join(self.key))
 
     @cached_property
     def config_hash(self) -> str:
@@ -132,55 +108,80 @@ class TrackedRun:
     @cached_property
     def content_hash(self) -> str:
         """Hash of files and settings."""
-        # 4 is a version: raise it when other metrics or settings are read from the files, and all
+        # 5 is a version: raise it when other metrics or settings are read from the files, and all
         # runs are imported again.
-        contents = {name: compute_sha256(path) for name, path in self.files.items()}
-        return compute_hash([4, self.config_hash, contents])
+        paths = (*self.fit_files, *self.files)
+        contents = {path.relative_to(self.root).as_posix(): compute_sha256(path) for path in paths}
+        return compute_hash([5, self.config_hash, contents])
+
+    @cached_property
+    def data_hash(self) -> str:
+        """First 16 digits of the checksum of the training data; "" without such data."""
+        return compute_sha256(self.data)[:16] if self.data and self.data.is_file() else ""
 
     @property
-    def end_ms(self) -> int:
-        """Time of the end in ms since 1970; 0 for a run that has not ended."""
-        return int(1000 * self.last_file.stat().st_mtime) if self.last_file else 0
+    def validation_hash(self) -> str:
+        """Hash of all that validation errors must have in common to be compared.
+
+        These are the stars, the parts into which they are split, the truth, and the noise.
+        """
+        return compute_hash([self.data_hash, *self.key, *map(self.config.get, TASK)])
 
     @property
-    def start_ms(self) -> int:
-        """Time of the start in ms since 1970, from the end and the duration."""
-        # The history counts seconds from the start of the training.
-        seconds = self.seconds
-        if seconds is None:
+    def params(self) -> dict[str, str]:
+        """All settings by their dotted names: texts unchanged, other values as JSON."""
+        return flatten(self.config) | dict(zip(KEY, self.key, strict=True))
+
+    @cached_property
+    def epochs(self) -> list[dict[str, float]]:
+        """Rows of the training history, whose columns are all numbers; none without a history."""
+        paths = [path for path in self.files if path.name.endswith(HISTORY)]
+        rows = (read_table(p, "epoch", "seconds", dtype=float).to_dict("records") for p in paths)
+        return [
+            {str(name): value for name, value in row.items()} for table in rows for row in table
+        ]
+
+    @property
+    def best_validation(self) -> dict[str, float]:
+        """Smallest validation error of the training, at which its network was kept, by its name."""
+        errors = [row.get("validation_mse", math.nan) for row in self.epochs]
+        finite = [error for error in errors if math.isfinite(error)]
+        return {"best_validation_mse": min(finite)} if finite else {}
+
+    @property
+    def times_ms(self) -> tuple[int, int]:
+        """Times of start and end in ms since 1970."""
+        # A job that was repeated has a row for each time; a history counts from its start.
+        cost, end = self.root / self.job, self.fit_files[0].stat().st_mtime
+        if self.job and cost.is_file():
+            seconds = read_table(cost, "s", sep="\t").s.iloc[-1]
+        else:
             seconds = max((row["seconds"] for row in self.epochs), default=0.0)
-        return self.end_ms - int(1000 * seconds)
+        return int(1000 * (end - seconds)), int(1000 * end)
 
 
-def convert_metric(name: str, value: float) -> tuple[str, int, float]:
-    """Return a metric as MLflow shows it: name, step and value.
+def flatten(tree: Mapping[str, Any]) -> dict[str, str]:
+    """Return the leaves of a config by their dotted names: text unchanged, other values as JSON."""
+    return {key: v if isinstance(v, str) else json.dumps(v) for key, v in leaves(tree)}
 
-    MLflow prints five decimals: a mean squared error is given in 1e-6, as its name says. The step
-    of a metric at a noise level λ is λ in 1e-6, with which the name begins, so that MLflow draws it
-    against λ in a section of its own. The step of other metrics is 0.
+
+def convert_metric(name: str, value: float) -> tuple[str, float]:
+    """Return a metric as MLflow shows it.
+
+    MLflow's table of runs prints numbers in full: a mean squared error is given in 1e-6, as its
+    name says. The metrics at the noise levels λ, at which names of tables end, are a section:
+    test_mse_0.001 becomes test_mse_1e-6/0.001.
     """
-    # The noise level at the end of the name.
-    level = re.search(r"_(\d[\d.e-]*)$", name)
-    name = name[: level.start()] if level else name
-    if "mse" in name.split("_"):
-        name, value = f"{name}_1e-6", 1e6 * value
-    return (
-        (f"lambda_1e-6/{name}", round(1e6 * float(level[1])), value) if level else (name, 0, value)
-    )
-
-
-def read_job_seconds(benchmark: Path) -> float | None:
-    """Return the duration of a job from Snakemake's table of its cost; None without the table."""
-    # A job that was repeated has a row for each time.
-    return read_table(benchmark, "s", sep="\t").s.iloc[-1] if benchmark.is_file() else None
+    stem, level = re.fullmatch(r"(.+?)(_\d[\d.e-]*)?", name).groups("")  # type: ignore[union-attr]  # matches any
+    unit = "_1e-6" if "mse" in stem.split("_") else ""
+    return f"{stem}{unit}{level.replace('_', '/')}", 1e6 * value if unit else value
 
 
 def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
-    """Read the finished runs of datasets.
+    """Read the finished runs of datasets: a run for each method of each evaluation.
 
-    An evaluation is the last file of a run; models still in training lack it. A method that is
-    fitted once for both references is measured against each of them; each of these measurements is
-    a run, so that the metrics of all methods with the same tags can be compared.
+    Models still in training lack an evaluation. A method that is fitted once for both references
+    has a run for each, so that the metrics of all methods with the same tags can be compared.
 
     Parameters
     ----------
@@ -197,100 +198,90 @@ def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[Track
     """
     runs = []
     for dataset, stars in datasets.items():
-        folder = results / "evaluation" / dataset
         # A table of errors for each split and reference.
+        folder = results / "evaluation" / dataset
         evaluations = sorted(folder.glob("*-*.csv"))
         if not evaluations:
             raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
         for path in evaluations:
-            # Every method in the table of errors that leaves files is a run.
-            split, reference = path.stem.split("-", 1)
-            method_names = {*read_table(path, "method").method}
-            for kind in list_methods():
-                if kind.storage and kind.name in method_names:
-                    runs.append(
-                        _read_fit_run(results, kind, (dataset, split, reference), stars, path)
-                    )
+            table = read_table(path, "method", "noise_level", "metric", "value", "stderr")
+            for name, rows in table.groupby("method", sort=False):
+                # Means over the noise levels, then each level with its standard error.
+                means = rows.groupby("metric").value.mean()
+                metrics = {f"test_{m}": means[m] for m in ("mse", "ssim") if m in means}
+                for _, r in rows.iterrows():
+                    names = (f"test_{r.metric}{part}_{r.noise_level:g}" for part in ("", "_stderr"))
+                    metrics |= dict(zip(names, (r.value, r.stderr), strict=True))
+                runs.append(_read_method_run(results, method(str(name)), stars, path, metrics))
     return runs
 
 
-def _read_fit_run(
-    results: Path, kind: type[Method], key: tuple[str, str, str], stars: Path, evaluation: Path
+def _read_method_run(
+    results: Path, kind: type[Method], stars: Path, table: Path, metrics: dict[str, float]
 ) -> TrackedRun:
-    """Read a fit to the stars of a dataset, and its evaluation.
+    """Read a method with the metrics of a table, the evaluation on the stars of a dataset."""
+    key = (table.parent.name, *table.stem.split("-", 1))
+    product = read_product(stars, "stars", ())
+    fields: dict[str, Any] = {}
+    # Settings of the fit, or of the evaluation for a method that is fitted there, such as the noisy
+    # image. A network trained on the stars of another telescope is another run.
+    if kind.storage is None:
+        tree = read_product(table.with_suffix(".h5"), "restored", ()).config
+        settings = {group: tree[group] for group in (*TASK, *kind.groups)}
+        source, fit_files, files = "/".join([kind.name, key[0], table.stem]), [table], []
+    else:
+        source = fits.get_fit_path(kind, *key)
+        fit = results / source
+        require_origin(fit, STARS, product)
+        settings, fit_files = kind.read_config(fit), fits.own_files(kind, fit)
+        # The evaluation, the course of a training, and figures.
+        diagnostics = [fits.path_beside(kind, fit, name) for name in kind.storage.diagnostics]
+        files = [table, *diagnostics, *sorted((results / "figures" / key[0]).glob("*.png"))]
+        fields["job"] = f"benchmarks/{fits.get_rule_name(kind)}/{fits.stem(kind, *key)}.tsv"
+        if kind.packing:
+            inputs = (kind, fit, stars, key[2], f"{key[0]}-{kind.name}")
+            fields["bundle"] = partial(make_bundle, *inputs)
+    # The number of the start that succeeded is a result, not a setting.
+    settings.pop("attempt", None)
+    config = {**product.config, **settings}
+    experiment = from_tree(stars, product.config, "scene", lambda scene: scene["experiment"])
+    place = (results, experiment, source, (kind.name, *key))
+    return TrackedRun(*place, config, fit_files, files, metrics, data=stars, **fields)
 
-    Its config holds the settings of the model and of its stars: a network trained on the
-    stars of another telescope is another run.
+
+def make_bundle(kind: type[Method], fit: Path, stars: Path, reference: str, name: str) -> Bundle:
+    """Return the bundle of a fit, without errors, which take a minute to measure.
+
+    The errors do not change its PSFs; `psfdae paper bundle` measures them.
 
     Parameters
     ----------
-    results : Path
-        Folder that the workflow writes to.
     kind : type of Method
-        Class of the fitted method.
-    key : tuple of three str
-        Dataset, split and reference of the training.
-    stars, evaluation : Path
-        Product "stars", and table of errors.
+        Class of the method.
+    fit, stars : Path
+        Files of the fit, and product "stars" of its training.
+    reference : str
+        Truth that is estimated.
+    name : str
+        Name of the model.
+
+    Raises
+    ------
+    ProductError
+        If the fit or the stars are damaged.
     """
-    dataset, split, reference = key
-    # The model must have been trained on the stars of the dataset.
-    model = results / fits.get_fit_path(kind, *key)
-    product = read_product(stars, "stars", ())
-    require_origin(model, STARS, product)
-    # The settings of the model are in a file of the fit, the settings of its stars in their
-    # product.
-    settings = kind.read_config(model)
-    # The number of the start that succeeded is a result, not a setting.
-    settings.pop("attempt", None)
-    # Means over the noise levels, the first that MLflow compares, then value and standard error of
-    # each metric at each level λ.
-    table = read_table(evaluation, "method", "noise_level", "metric", "value", "stderr")
-    rows = table[table.method == kind.name]
-    metrics: dict[str, float] = {}
-    for metric in TrackedRun.averaged_metrics:
-        if metric in {*rows.metric}:
-            metrics[f"test_{metric}"] = fmean(rows.value[rows.metric == metric])
-    for row in rows.to_dict("records"):
-        metrics[f"test_{row['metric']}_{row['noise_level']:g}"] = row["value"]
-        metrics[f"test_{row['metric']}_stderr_{row['noise_level']:g}"] = row["stderr"]
-    # Figures of the dataset, without those whose name has another split or reference.
-    figures = {}
-    folder = results / "figures" / dataset
-    for path in sorted(folder.rglob("*.png")):
-        name = path.relative_to(folder).as_posix()
-        label = re.match("(random|held_out)(-(realisation|template))?", name)
-        if label is None or label[0] in (split, f"{split}-{reference}"):
-            figures[f"figures/{name}"] = path
-    # Methods that are trained in epochs have a history.
-    storage = fits.get_storage(kind)
-    history = fits.path_beside(kind, model, HISTORY) if HISTORY in storage.diagnostics else None
-    job = f"{fits.get_rule_name(kind)}/{fits.stem(kind, *key)}"
-    return TrackedRun(
-        kind=kind.name,
-        dataset=dataset,
-        split=split,
-        reference=reference,
-        source=fits.get_fit_path(kind, *key),
-        name=" ".join([kind.name, *key]),
-        experiment=from_tree(stars, product.config, "scene", lambda scene: scene["experiment"]),
-        files={**_model_files(kind, model), "evaluation.csv": evaluation, **figures},
-        config={**product.config, **settings},
-        last_file=fits.outputs(kind, model)[0],
-        metrics=metrics,
-        data=stars,
-        fit=(kind, model) if kind.packing else None,
-        epochs=_epochs(history) if history else (),
-        seconds=read_job_seconds(results / f"benchmarks/{job}.tsv"),
-    )
+    fit_config, product = kind.read_config(fit), read_stars(stars, reference)
+    # Groups of settings that decide which stars a fit was trained on, and with which noise.
+    config, estimator = part(TASK, {g: fit_config[g] for g in TASK}), kind.load(fit, reference)
+    inputs = (estimator, product, reference, config, fit_config)
+    return build_uncalibrated(*inputs, name, "not stated")[0]
 
 
-def _model_files(kind: type[Method], path: Path) -> dict[str, Path]:
-    """List the files of a fit by their names within the run; `model/` is what the method loads."""
-    model = {f"{TrackedRun.model_prefix}{file.name}": file for file in fits.own_files(kind, path)}
-    # Course of the training and the like, which `load` does not need.
-    diagnostics = fits.get_storage(kind).diagnostics
-    return model | {name: fits.path_beside(kind, path, name) for name in diagnostics}
+def _list_fit_files(kind: str, place: Path) -> list[Path]:
+    """Return the files of a method, or of a network of scene 3; `place` is its folder or file."""
+    if kind in estimators.ESTIMATORS:
+        return [place / estimators.Estimator.weights_file, place / CONFIG]
+    return fits.own_files(method(kind), place)
 
 
 def read_alignment_runs(results: Path) -> list[TrackedRun]:
@@ -301,57 +292,29 @@ def read_alignment_runs(results: Path) -> list[TrackedRun]:
     ProductError
         If a file is missing or damaged; the table of errors is the last one of the scene.
     """
+    keys, values = ("test_set", "parameter", "noise_level"), ("mean_abs_error", "bias", "variance")
     errors = results / "tables/alignment_errors.csv"
-    if not errors.is_file():
-        raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
-    columns = ("test_set", "noise_level", "method", "parameter", "unit")
-    table = read_table(errors, *columns, "mean_abs_error", "bias", "variance")
+    table = read_table(errors, *keys, *values, "method", "unit")
     # All networks share the table of errors and the figures of the scene.
-    figures = sorted((results / "figures/alignment").glob("*.png"))
-    scene_files = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
+    files = [errors, *sorted((results / "figures/alignment").glob("*.png"))]
     runs = []
-    for kind in ("dae", *list_trained_networks()):
-        weights = DAE_WEIGHTS if kind == "dae" else Estimator.weights_file
-        folder = results / "alignment" / kind
+    for kind in ("dae", *estimators.list_trained_networks()):
+        source, key = f"alignment/{kind}", (kind, "alignment", "uniform and grid", "states")
         # As for datasets, the number of the start that succeeded is not a setting.
-        config = read_yaml(folder / CONFIG)
+        config = read_yaml(results / source / CONFIG)
         config.pop("attempt", None)
         # Errors of the state parameters in units of their range, by test set and noise level.
-        rows = table[(table.method == kind) & (table.unit == "range")]
+        rows = table[(table.method == kind) & (table.unit == "range")].melt([*keys], [*values])
         if rows.empty:
             raise ProductError(f"{errors}: no rows of method {kind!r}")
-        metrics = {
-            f"{row['test_set']}_{row['parameter']}_{name}_{row['noise_level']:g}": row[name]
-            for row in rows.to_dict("records")
-            for name in ("mean_abs_error", "bias", "variance")
-        }
+        metrics = {f"{r[0]}_{r[1]}_{r[3]}_{r[2]:g}": r[4] for r in rows.to_numpy()}
         # The set of states on which it was trained.
-        states = "grid" if kind == "dae" else ESTIMATORS[kind].states
-        runs.append(
-            TrackedRun(
-                kind=kind,
-                dataset="alignment",
-                split="uniform and grid",
-                reference="states",
-                source=f"alignment/{kind}",
-                name=f"alignment {kind}",
-                experiment="scene3",
-                files={**_network_files(folder, weights), **scene_files},
-                config=config,
-                last_file=folder / weights,
-                metrics=metrics,
-                data=results / f"data/alignment/{states}.h5",
-                epochs=_epochs(folder / HISTORY),
-                seconds=read_job_seconds(results / f"benchmarks/alignment/{kind}.tsv"),
-            )
-        )
+        states = "grid" if kind == "dae" else estimators.ESTIMATORS[kind].states
+        data, job = results / f"data/alignment/{states}.h5", f"benchmarks/{source}.tsv"
+        fit_files, history = _list_fit_files(kind, results / source), results / source / HISTORY
+        content = (config, fit_files, [history, *files], metrics)
+        runs.append(TrackedRun(results, "scene3", source, key, *content, job, data=data))
     return runs
-
-
-def _network_files(folder: Path, weights: str) -> dict[str, Path]:
-    """List the files of a network of scene 3 by their names within the run."""
-    model = {f"{TrackedRun.model_prefix}{name}": folder / name for name in (weights, CONFIG)}
-    return model | {HISTORY: folder / HISTORY}
 
 
 def read_night_runs(results: Path) -> list[TrackedRun]:
@@ -365,28 +328,15 @@ def read_night_runs(results: Path) -> list[TrackedRun]:
     night = read_night(results / "night/night.csv", "image", "name", "verdict")
     runs = []
     for row in night[night.verdict != "failed"].to_dict("records"):
-        name = str(row["name"])
-        source = f"night/images/{name}{SUFFIX}"
-        # All numbers of the row are metrics, and the texts tags.
-        numbers = {str(k): float(v) for k, v in row.items() if isinstance(v, int | float)}
-        texts = {str(k): v for k, v in row.items() if isinstance(v, str) and v}
-        runs.append(
-            TrackedRun(
-                kind="field",
-                dataset="night",
-                split="held_out",
-                reference="realisation",
-                source=source,
-                name=name,
-                experiment="night",
-                files={f"{TrackedRun.model_prefix}{name}{SUFFIX}": results / source},
-                config={"image": row["image"]},
-                last_file=results / source,
-                metrics={k: number for k, number in numbers.items() if math.isfinite(number)},
-                seconds=0.0,
-                tags={key: texts[key] for key in ("verdict", "reason", "time") if key in texts},
-            )
-        )
+        source = f"night/images/{row['name']}{SUFFIX}"
+        model, key = results / source, ("field", "night", "held_out", "realisation")
+        # All numbers of the row are metrics, and some texts tags.
+        metrics = {str(k): float(v) for k, v in row.items() if isinstance(v, int | float)}
+        tags = {k: str(row[k]) for k in ("verdict", "reason", "time") if row.get(k, "") != ""}
+        place, config = (results, "night", source, key), {"image": row["image"]}
+        labels: dict[str, Any] = {"name": str(row["name"]), "tags": tags, "metrics": metrics}
+        bundle = partial(read_bundle, model)
+        runs.append(TrackedRun(*place, config, [model], bundle=bundle, **labels))
     return runs
 
 
@@ -398,131 +348,52 @@ def read_sweep_runs(results: Path, name: str) -> list[TrackedRun]:
     ProductError
         If the summary of the sweep or the result of a point is missing.
     """
-    folder = results / "sweeps" / name
-    summary = folder / "summary.csv"
-    if not summary.is_file():
-        raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
+    source, folder = f"sweeps/{name}", results / "sweeps" / name
     # A row of the summary for each point, and a run of its own.
-    table = read_table(summary, "point", "status", dtype=str)
-    # The parent has the split and the reference of its points, which all are the same.
+    table = read_table(folder / "summary.csv", "point", "status", dtype=str)
     points = [_read_point_run(results, name, point) for point in table.point]
-    tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
-    paths = [*tables, *sorted((folder / "figures").glob("*.png"))]
     # Metrics of the best point, and numbers of points by their status.
     best_point = read_yaml(folder / "best.yaml")
     metrics = {f"best_{key}": value for key, value in best_point.get("metrics", {}).items()}
-    for status in ("finished", "stopped", "failed"):
-        metrics[f"points_{status}"] = float((table.status == status).sum())
-    parent = TrackedRun(
-        kind="sweep",
-        **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
-        source=f"sweeps/{name}",
-        name=f"sweep {name}",
-        # Every sweep is an experiment of its own, apart from the paper's scenes.
-        experiment=f"sweep_{name}",
-        files={path.relative_to(folder).as_posix(): path for path in paths},
-        config=read_yaml(folder / "sweep.yaml"),
-        last_file=summary,
-        metrics=metrics,
-        tags={"best_point": str(best_point.get("point", ""))},
-        # From the start of its first point.
-        seconds=summary.stat().st_mtime - min(point.start_ms for point in points) / 1000,
-    )
-    return [parent, *points]
+    metrics |= {f"points_{k}": float(n) for k, n in table.status.value_counts().items()}
+    # Every sweep is an experiment of its own. Its points have the same stars, split and reference.
+    tables = [folder / file for file in ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")]
+    figures = sorted((folder / "figures").glob("*.png"))
+    content = (read_yaml(folder / "sweep.yaml"), tables, figures, metrics)
+    place = (results, f"sweep_{name}", source, ("sweep", *points[0].key[1:]))
+    tags = {"best_point": str(best_point.get("point", ""))}
+    return [TrackedRun(*place, *content, name=f"sweep {name}", tags=tags), *points]
 
 
 def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:
     """Read a point of the sweep `name`; a failed point has only files of its result and cost."""
     from psfdae_paper.sweeps.measurement import locate_fit
 
-    # A point has a folder with all its files.
-    folder = results / "sweeps" / name / "points" / point
+    # A point has a folder with all its files; one that was stopped or failed lacks some of them.
+    source = f"sweeps/{name}/points/{point}"
+    folder = results / source
     result = read_json(folder / "result.json")
-    model, config = result["model"], result["config"]
+    kind, config = result["model"], result["config"]
     # Files of the model, and the product with its training data if the workflow made it.
-    data = None
-    if model in list_swept_networks():
-        model_files = _network_files(folder, Estimator.weights_file)
-        data = results / f"data/alignment/{ESTIMATORS[model].states}.h5"
+    if kind in estimators.list_swept_networks():
+        place, data = folder, f"alignment/{estimators.ESTIMATORS[kind].states}"
     else:
-        model_files = _model_files(method(model), locate_fit(method(model), folder))
-        with suppress(KeyError):
-            data = results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
-    # A point that was stopped or failed lacks some of these.
-    tables = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
-    files = {file: folder / file for file in tables} | model_files
-    history = folder / HISTORY
+        place = locate_fit(method(kind), folder)
+        data = "/".join(config.get(group, {}).get("name", "") for group in ("scene", "stars"))
+    names = ("cost.json", "evaluation.csv", "validation.csv", HISTORY)
+    fit_files = [folder / "result.json", *filter(Path.is_file, _list_fit_files(kind, place))]
+    files = [*filter(Path.is_file, (folder / name for name in names))]
     # The run is named by the values of the point on the axes of the sweep.
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
     return TrackedRun(
-        kind=model,
-        **{key: result[key] for key in ("dataset", "split", "reference")},
-        source=f"sweeps/{name}/points/{point}",
+        results,
+        f"sweep_{name}",
+        source,
+        (kind, *(result[key] for key in KEY[1:])),
+        *(config, fit_files, files, result["metrics"]),
+        job=f"benchmarks_on_request/sweep/{name}/{point}.tsv",
         name=values or point,
-        experiment=f"sweep_{name}",
-        files={file: path for file, path in files.items() if path.is_file()},
-        config={**config, "axes": result["values"]},
-        last_file=folder / "result.json",
-        metrics=result["metrics"],
-        epochs=_epochs(history) if history.is_file() else (),
-        seconds=read_job_seconds(results / f"benchmarks_on_request/sweep/{name}/{point}.tsv"),
-        status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
-        data=data,
+        data=results / f"data/{data}.h5",
     )
-
-
-def select_settings(run: TrackedRun, preset: str) -> dict[str, str]:
-    """Return the settings that distinguish a run from others, by their dotted names.
-
-    These are its method, the settings in which datasets differ, and the settings that differ from
-    the configuration of this dataset and preset. The choice does not depend on other runs.
-    """
-    # Always shown: the settings in which the paper's datasets differ.
-    dataset_keys = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
-    defaults = {}
-    # Stars other than the datasets, such as a user's own, lack defaults.
-    if run.dataset in list_datasets() and (config_dir() / f"preset/{preset}.yaml").is_file():
-        # Settings of the dataset as the preset alone has them.
-        defaults = flatten(load((f"dataset={run.dataset}", f"preset={preset}")).model_dump())
-    differing = {
-        key: value
-        for key, value in flatten(run.config).items()
-        if key in dataset_keys or defaults.get(key) != value
-    }
-    return {"method": run.kind, "split": run.split, "reference": run.reference, **differing}
-
-
-def flatten(tree: Mapping[str, Any]) -> dict[str, str]:
-    """Return the leaves of a config by their dotted names: text unchanged, other values as JSON."""
-    return {key: v if isinstance(v, str) else json.dumps(v) for key, v in leaves(tree)}
-
-
-def _epochs(history: Path) -> list[dict[str, float]]:
-    """Read the rows of a training history, whose columns are all numbers."""
-    rows = read_table(history, "epoch", "seconds", dtype=float).to_dict("records")
-    return [{str(name): value for name, value in row.items()} for row in rows]
-
-
-def epoch_metrics(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Metric]:
-    """Return the metrics of every epoch of a history, and the best validation error.
-
-    `start_ms` is the start of the training in ms since 1970.
-    """
-    from mlflow.entities import Metric
-
-    # Other columns of the history are counters and times, not metrics.
-    metrics = [
-        Metric(f"epoch/{name}", value, start_ms + int(1000 * row["seconds"]), int(row["epoch"]))
-        for row in epochs
-        for name, _, value in starmap(convert_metric, row.items())
-        if name not in ("epoch", "step", "seconds", "cpu_seconds")
-    ]
-    # MLflow's lists show the last value of a metric; the network that is stored has the lowest.
-    errors = [m for m in metrics if "/validation_mse" in m.key and math.isfinite(m.value)]
-    if errors:
-        best_metric = min(errors, key=lambda m: m.value)
-        name = best_metric.key.replace("epoch/", "best_")
-        metrics.append(Metric(name, best_metric.value, best_metric.timestamp, best_metric.step))
-    return metrics

@@ -14,6 +14,8 @@ from psfdae_paper.stages import track
 
 TABLES = ("runs", "metrics", "params", "tags", "inputs", "logged_models", "model_versions")
 PNG = b"\x89PNG\r\n\x1a\n"
+ALL = ("noisy", "pca_som", "dae")
+"""The methods of the table of errors, each of which is a run."""
 HISTORY = ((1, 3e-5, "nan", 1.5), (2, 2e-5, 1e-5, 3.0), (3, 1e-5, 2e-5, 4.5))
 
 
@@ -65,6 +67,10 @@ def write_tree(results):
         for metric, value in (("mse", i * 1e-5), ("ssim", i / 10)):
             rows.append(f"{dataset},random,{reference},{method},0.003,{metric},{value:g},1e-7,50")
     evaluation.write_text("\n".join([*rows, ""]))
+    key = {"dataset": dataset, "split": "random", "reference": reference}
+    tree = yaml.safe_load((dae / "config.yaml").read_text())
+    settings = {group: tree[group] for group in ("seed", "noise", "parts")}
+    write_product(evaluation.with_suffix(".h5"), "restored", values, {**settings, **key})
     # What Snakemake says of the job.
     write_text(results / "benchmarks/baseline/dataset3/random.tsv", "s\tmax_rss\n12.5\t90\n")
     figures = results / f"figures/{dataset}"

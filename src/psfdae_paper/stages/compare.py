@@ -26,6 +26,7 @@ from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation import comparison
 from psfdae_paper.evaluation.comparison import SIGNIFICANT
 from psfdae_paper.evaluation.measure import CELL, read_tables
+from psfdae_paper.evaluation.record_tables import compare_values, list_tables
 from psfdae_paper.tracking import flatten
 
 
@@ -65,7 +66,8 @@ def compare(
     or a point of a sweep; of two folders of results, all networks that both have are compared. The
     text has settings that differ, the trainings, and errors with their significance. Where a folder
     has only tables, such as results/reference, the mean errors are compared: which are equal, and
-    which differ by more than the scatter between seeds.
+    which differ by more than the scatter between seeds; then the values of all other tables, with
+    the scatter of each, but no times.
 
     Differences are paired star by star where both runs have the same noisy images.
 
@@ -80,7 +82,8 @@ def compare(
         raise ComparisonError("name at least two runs to compare")
     # Folders with tables alone are compared by mean errors, others star by star.
     if all(map(_tables, runs)) and not all(map(_networks, runs)):
-        blocks = [describe_tables(runs[0], folder) for folder in runs[1:]]
+        describers = (describe_tables, describe_further_tables)
+        blocks = [describe(runs[0], folder) for folder in runs[1:] for describe in describers]
     else:
         groups = ([read_run(*paths) for paths in group] for group in _groups(runs))
         blocks = [describe(group[0], run) for group in groups for run in group[1:]]
@@ -277,6 +280,46 @@ def describe_tables(first: Path, second: Path) -> str:
     ]
     lines += [f"  - {_cell(key)}" for key in order.index[order.exchanged]]
     return "\n".join(lines)
+
+
+def describe_further_tables(first: Path, second: Path) -> str:
+    """Return as Markdown the tables that differ by more than their scatter, without mean errors.
+
+    Parameters
+    ----------
+    first, second : Path
+        Folders A and B, each with tables.
+
+    Returns
+    -------
+    str
+        A line for each table that differs, with its first values that do.
+
+    Raises
+    ------
+    ProductError
+        If a table is damaged.
+    """
+    # The mean errors are compared by `describe_tables`, with the scatter between seeds.
+    names, other_names = (list_tables(run) - {"tables/psf_metrics.csv"} for run in (first, second))
+    tables = {name: compare_values(first, second, name) for name in sorted(names & other_names)}
+    lines, shown = [], 4
+    for name, values in tables.items():
+        # Values that differ, then rows without a counterpart.
+        differing = values[values.verdict == "beyond"]
+        missing = int((values.verdict == "missing").sum())
+        if missing or len(differing):
+            counts = f"{len(differing)} of {len(values) - missing} values differ by more than their"
+            lone_rows = f"; {missing} rows are in one alone" if missing else ""
+            lines += [f"- **{name}**: {counts} scatter{lone_rows}"]
+        rows = differing.head(shown).itertuples()
+        lines += [f"  - {row.row}: {row.column} {row.first} (A), {row.second} (B)" for row in rows]
+        lines += [f"  - and {len(differing) - shown} more"] * (len(differing) > shown)
+    equal = sum((values.verdict == "equal").all() for values in tables.values())
+    summary = f"{len(tables)} further tables are in both; {equal} are equal to the last digit."
+    lone = sorted(other_names - names)
+    lines += [f"- Not in A: {', '.join(lone)}"] * bool(lone)
+    return "\n".join(["## Further tables", "", summary, *lines])
 
 
 def _row_lines(rows: pd.DataFrame) -> list[str]:

@@ -2,8 +2,12 @@
 
 The results folder is authoritative and the database a view of it: a lost database is rebuilt by
 running the stage again. Input: folders with results (`psfdae_paper.tracking` reads them). Outputs:
-runs in a database or on a server, their models (`psfdae_paper.registry`) and views
-(`psfdae_paper.views`), and a receipt with the action for each run.
+runs in a database or on a server, their models (`psfdae_paper.registry`), and a receipt with the
+action for each run.
+
+A training shows its epochs in MLflow while it runs, if the environment asks for it by
+PSFDAE_EPOCHS=psfdae_paper.stages.track:logger (`psfdae.methods.networks.training.listener`); so
+does `make reproduce TRACK=live`.
 """
 
 from __future__ import annotations
@@ -11,40 +15,31 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
+import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import starmap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.base.errors import Error
-from psfdae.base.files import as_csv, as_yaml, compute_sha256, write_text
+from psfdae.base.files import as_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
 from psfdae.base.version import __version__
-from psfdae.methods.interface import CONFIG
+from psfdae_paper import registry, tracking
 from psfdae_paper.configuration.command import command
-from psfdae_paper.registry import choose_best, forget, link_files, log_model, make_model_name
+from psfdae_paper.mlflow_files import open_artifacts
 from psfdae_paper.source import git_commit
-from psfdae_paper.tracking import (
-    TrackedRun,
-    convert_metric,
-    epoch_metrics,
-    read_alignment_runs,
-    read_dataset_runs,
-    read_night_runs,
-    read_sweep_runs,
-    select_settings,
-)
-from psfdae_paper.views import show
+from psfdae_paper.tracking import KEY, TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Metric, Param
 
-SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
+    from psfdae.methods.networks.training import Row
+
+SLOT = (*KEY, "preset", "source")
 """Tags that name a position in the results folder; with `config_hash` they identify a run."""
 
 LIVE = "live"
@@ -94,10 +89,10 @@ def track(
         The points of a sweep.
     """
     # Methods, networks of scene 3, images of a night and sweeps; a sweep before its points.
-    runs = read_dataset_runs(results, dict(stars))
-    runs += read_alignment_runs(results) if alignment else []
-    runs += read_night_runs(results) if night else []
-    runs += [run for sweep in sweeps for run in read_sweep_runs(results, sweep)]
+    runs = tracking.read_dataset_runs(results, dict(stars))
+    runs += tracking.read_alignment_runs(results) if alignment else []
+    runs += tracking.read_night_runs(results) if night else []
+    runs += [run for sweep in sweeps for run in tracking.read_sweep_runs(results, sweep)]
     import_runs(runs, preset, database, out)
 
 
@@ -120,125 +115,93 @@ def import_runs(runs: Sequence[TrackedRun], preset: str, database: Path, receipt
     TrackingError
         If the database cannot be used.
     """
-    uri = server()
-    # Tags with the version of the program that imported the runs.
-    import_tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
-    # MLflow's id of each run, and the action.
-    outcomes: list[tuple[str, str]] = []
-    with lock_database(database):
-        try:
-            for outcome in _import(runs, import_tags, uri, database):
-                outcomes.append(outcome)
-        except Exception as error:
-            # A server that fails must not stop a workflow; a database is a file to be mended.
-            if not is_external_error(error):
-                raise
-            if not uri:
-                raise TrackingError(
-                    f"{database}: {first_line(error)} (if it is damaged, delete it: the next "
-                    "import rebuilds it)"
-                ) from error
-            print(
-                f"MLflow at {uri} cannot be used: {first_line(error)}\n"
-                f"Not sent: {', '.join(run.name for run in runs[len(outcomes) :])}\n"
-                "To send later, repeat the import (snakemake --forcerun track)."
-            )
-    outcomes += [("", "not sent")] * (len(runs) - len(outcomes))
+    # Tags of each run, with the version of the program; its id in MLflow and the action.
+    versions = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
+    tags = [{**make_tags(run), **versions} for run in runs]
+    outcomes = [("", "not sent")] * len(runs)
+    run_ids: dict[str, str] = {}
+    try:
+        with open_mlflow(database) as client:
+            for i, run in enumerate(steps("runs", runs)):
+                if run.parent:
+                    # MLflow shows a run with this tag as a part of another.
+                    tags[i]["mlflow.parentRunId"] = run_ids[run.parent]
+                outcomes[i] = import_run(client, run, tags[i])
+                run_ids[run.source] = outcomes[i][0]
+            # The best version of each model depends on all runs.
+            for run in runs:
+                registry.choose_best(client, find_experiment(client, run.experiment), run)
+    except TrackingError as error:
+        # A server that fails must not stop a workflow; a database is a file to be mended.
+        if not server():
+            raise
+        unsent = ", ".join(r.name for r, o in zip(runs, outcomes, strict=True) if not o[0])
+        print(f"{error}\nNot sent: {unsent}\nTo send later: snakemake --forcerun track")
     # The receipt: a row for each run.
-    rows = []
-    for run, (run_id, action) in zip(runs, outcomes, strict=True):
-        tags = {"preset": preset, **make_tags(run)}
-        row = {"run_id": run_id, "action": action, "experiment": run.experiment}
-        rows.append(row | {key: tags[key] for key in (*SLOT, "config_hash")})
+    rows = [
+        {"run_id": run_id, "action": action, **{key: row[key] for key in (*SLOT, "config_hash")}}
+        for (run_id, action), row in zip(outcomes, tags, strict=True)
+    ]
     write_text(receipt, as_csv(rows))
-    counts = sorted(Counter(action for _, action in outcomes).items())
-    print(f"{len(runs)} runs:", ", ".join(f"{count} {action}" for action, count in counts))
+    counts = Counter(row["action"] for row in rows)
+    print(f"{len(runs)} runs:", ", ".join(f"{counts[key]} {key}" for key in sorted(counts)))
 
 
 def server() -> str:
-    """Return the address of the server that the environment names, "" if none; set up MLflow.
+    """Return the address of the server that MLFLOW_TRACKING_URI names, "" if it is not set.
 
-    MLFLOW_TRACKING_URI names it; without one, runs go into a database of the results folder.
+    Without one, runs go into a database of the results folder.
     """
-    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-    # MLflow's default timeouts add up to minutes if a server does not answer.
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     return os.environ.get("MLFLOW_TRACKING_URI", "")
 
 
 @contextmanager
-def lock_database(database: Path) -> Iterator[None]:
-    """Wait for other importers: two at once would damage a new database.
+def open_mlflow(database: Path) -> Iterator[MlflowClient]:
+    """Open the server, or else the database, which is created if missing.
+
+    Other importers wait meanwhile: two at once would damage a new database.
 
     Parameters
     ----------
     database : Path
-        SQLite file; the lock is a hidden file in its folder.
+        SQLite file, if there is no server; the lock is a hidden file in its folder.
+
+    Yields
+    ------
+    MlflowClient
+        Client of the server or the database.
+
+    Raises
+    ------
+    TrackingError
+        If the server, the database or the disk fails.
     """
-    import fcntl
-
-    # The system releases the lock of a process that ends.
-    database.parent.mkdir(parents=True, exist_ok=True)
-    with database.with_name(f".{database.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-def _import(
-    runs: Sequence[TrackedRun], import_tags: dict[str, str], uri: str, database: Path
-) -> Iterator[tuple[str, str]]:
-    """Import one run after the other; yield MLflow's id and the action for each.
-
-    Parameters
-    ----------
-    runs : sequence of TrackedRun
-        A parent before its children.
-    import_tags : dict of str
-        Tags that all runs of this import have.
-    uri : str
-        Address of a server; "" takes the database.
-    database : Path
-        SQLite file, if there is no server.
-    """
-    client = make_client(uri, database)
-    # MLflow's ids of the experiments by name, and of the runs by their source.
-    experiments: dict[str, str] = {}
-    run_ids: dict[str, str] = {}
-    for run in steps("runs", runs):
-        if run.experiment not in experiments:
-            experiments[run.experiment] = find_experiment(client, run.experiment, uri, database)
-        tags = {**import_tags, **make_tags(run)}
-        if run.parent:
-            # MLflow shows a run with this tag as a part of another.
-            tags["mlflow.parentRunId"] = run_ids[run.parent]
-        outcome = import_run(client, experiments[run.experiment], run, tags)
-        run_ids[run.source] = outcome[0]
-        yield outcome
-    # These depend on all runs: the best version of each model, and tables that compare runs.
-    for name in dict.fromkeys(make_model_name(run) for run in runs if run.fit):
-        choose_best(client, name)
-    for name, experiment in experiments.items():
-        show(client, experiment, [run for run in runs if run.experiment == name])
-
-
-def make_client(uri: str, database: Path) -> MlflowClient:
-    """Return a client of a server, or else of the database, which is created if missing.
-
-    Parameters
-    ----------
-    uri : str
-        Address of a server; "" takes the database.
-    database : Path
-        SQLite file.
-    """
+    # MLflow's default timeouts add up to minutes if a server does not answer.
+    defaults = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
+    os.environ |= {**defaults, "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", **os.environ}
+    from filelock import FileLock
     from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+    from mlflow.store.artifact import artifact_repository_registry as repositories
+    from sqlalchemy.exc import SQLAlchemyError
 
-    return MlflowClient(uri or f"sqlite:///{database.resolve()}")
+    # Other programs find this function by the entry point of the installed package.
+    schemes: dict[str, Any] = repositories.get_registered_artifact_repositories()
+    schemes["mlflow-artifacts"] = open_artifacts
+    try:
+        with FileLock(database.with_name(f".{database.name}.lock")):
+            yield MlflowClient(server() or f"sqlite:///{database.resolve()}")
+    except (MlflowException, SQLAlchemyError, OSError) as error:
+        # Any other error is a mistake of this program, and is not hidden.
+        advice = "" if server() else "; if it is damaged, delete it: the next import rebuilds it"
+        line = str(error).strip().split("\n", 1)[0]
+        raise TrackingError(f"{server() or database}: {line}{advice}") from error
 
 
-def find_experiment(client: MlflowClient, name: str, uri: str, database: Path) -> str:
+def find_experiment(client: MlflowClient, name: str) -> str:
     """Return the id of an experiment, which is created if missing.
+
+    Its files have addresses that name no folder (`psfdae_paper.mlflow_files.open_artifacts`).
 
     Parameters
     ----------
@@ -246,34 +209,20 @@ def find_experiment(client: MlflowClient, name: str, uri: str, database: Path) -
         Client of the database or server.
     name : str
         Name of the experiment.
-    uri : str
-        Address of a server; "" for the database.
-    database : Path
-        SQLite file.
-
-    Returns
-    -------
-    str
-        MLflow's id.
 
     Raises
     ------
     TrackingError
-        If the files of the database are not in `mlartifacts` in its folder.
+        If an earlier version has made the database, whose files have absolute paths.
     """
     # A server decides itself where artifacts go.
-    is_served = uri.startswith(("http", "databricks"))
-    location = None if is_served else (database.parent.resolve() / "mlartifacts" / name).as_uri()
-    # An experiment that was deleted keeps its name: it is restored.
+    location = None if server() else f"mlflow-artifacts:/{name}"
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         return str(client.create_experiment(name, artifact_location=location))
-    if not uri and experiment.artifact_location != location:
-        # A copied results folder would otherwise write into the original's files.
-        raise TrackingError(
-            f"the database keeps its files in {experiment.artifact_location}, not in {location}; "
-            "was the results folder moved? Delete mlflow.db and import again"
-        )
+    if location and experiment.artifact_location != location:
+        raise TrackingError("mlflow.db: of an earlier version: delete it, and mlartifacts")
+    # An experiment that was deleted keeps its name: it is restored.
     if experiment.lifecycle_stage == "deleted":
         client.restore_experiment(experiment.experiment_id)
     return str(experiment.experiment_id)
@@ -294,17 +243,13 @@ def delete_live(client: MlflowClient, source: str) -> None:
             client.delete_run(run.info.run_id)
 
 
-def import_run(
-    client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]
-) -> tuple[str, str]:
+def import_run(client: MlflowClient, run: TrackedRun, tags: dict[str, str]) -> tuple[str, str]:
     """Leave exactly one active run with the files and settings of a run.
 
     Parameters
     ----------
     client : MlflowClient
         Client of the database or server.
-    experiment : str
-        Id of the experiment.
     run : TrackedRun
         Finished run, with its files.
     tags : dict of str
@@ -315,34 +260,29 @@ def import_run(
     run_id, action : str
         MLflow's id of the run, and created, updated or unchanged.
     """
-    # Active runs of this stage with the same position in the results folder. The source implies the
-    # method, for which earlier versions had other names.
-    conditions = [f"tags.{key} = '{tags[key]}'" for key in SLOT if key != "kind"]
-    query = " and ".join([*conditions, "tags.config_hash LIKE '%'"])
-    slot = client.search_runs([experiment], query)
-    # Of these, the ones with the same settings, and the one with the same files as well.
-    make_settings = [old for old in slot if old.data.tags["config_hash"] == run.config_hash]
-    # An import that was killed leaves a run without content_hash.
-    same_runs = [r for r in make_settings if r.data.tags.get("content_hash") == run.content_hash]
-    # Of a run with the same files, only tags that depend on other runs are changed.
-    if same_runs:
-        run_id, action = str(same_runs[0].info.run_id), "unchanged"
-        for key in ("superseded", "mlflow.parentRunId"):
-            # A parent that has new files is another run.
-            if key in tags and same_runs[0].data.tags.get(key) != tags[key]:
-                client.set_tag(run_id, key, tags[key])
+    experiment = find_experiment(client, run.experiment)
+    # Runs with the same position in the results folder; of these, the ones with the same settings;
+    # and of these, one with the same files. An import that was killed leaves no content_hash.
+    slot = client.search_runs([experiment], " and ".join(f"tags.{k} = '{tags[k]}'" for k in SLOT))
+    twins = [old for old in slot if old.data.tags.get("config_hash") == run.config_hash]
+    current = [old for old in twins if old.data.tags.get("content_hash") == run.content_hash][:1]
+    if current:
+        # Only tags that depend on other runs are changed: a parent with new files is another run.
+        run_id, action = str(current[0].info.run_id), "unchanged"
+        for key in tags.keys() & {"superseded", "mlflow.parentRunId"}:
+            client.set_tag(run_id, key, tags[key])
     else:
-        run_id = create_run(client, experiment, run, tags)
-        action = "updated" if make_settings else "created"
+        run_id, action = (
+            create_run(client, experiment, run, tags),
+            "updated" if twins else "created",
+        )
     # Other runs of the same settings, and the live run of the training, are deleted; runs of other
     # settings are superseded.
     for old in slot:
-        if old.info.run_id == run_id:
-            continue
-        if old in make_settings:
-            forget(client, old.info.run_id)
-        elif old.data.tags.get("superseded") != "true":
+        if old not in twins:
             client.set_tag(old.info.run_id, "superseded", "true")
+        elif old not in current:
+            registry.forget(client, old.info.run_id)
     delete_live(client, run.source)
     return run_id, action
 
@@ -350,8 +290,7 @@ def import_run(
 def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dict[str, str]) -> str:
     """Create a complete run in MLflow, and return its id.
 
-    It has tags, data, model, metrics, parameters and files. The parameters are the settings that
-    distinguish it (`select_settings`); all settings are in its file config.yaml.
+    It has tags, data, model, metrics, files, and all settings as parameters.
 
     Parameters
     ----------
@@ -363,51 +302,60 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
         Finished run, with its files.
     tags : dict of str
         All tags of the run.
-
-    Returns
-    -------
-    str
-        MLflow's id of the run.
     """
-    from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
+    from mlflow.entities import Dataset, DatasetInput, InputTag, Param
 
-    run_id: str = client.create_run(experiment, run.start_ms, tags, run.name).info.run_id
+    start_ms, end_ms = run.times_ms
+    run_id: str = client.create_run(experiment, start_ms, tags, run.name).info.run_id
     # Metrics of the finished run name the data that it was trained on, and its model.
     origin: dict[str, str] = {}
-    if run.data is not None and run.data.is_file():
-        source = json.dumps({"uri": run.data.resolve().as_uri()})
-        # Sixteen digits of the checksum identify a dataset.
-        data = Dataset(run.dataset, compute_sha256(run.data)[:16], "local", source)
+    if run.data and run.data_hash:
+        source = json.dumps({"uri": run.data.relative_to(run.root).as_posix()})
+        data = Dataset(run.key[1], run.data_hash, "local", source)
         training = [InputTag("mlflow.data.context", "training")]
         client.log_inputs(run_id, [DatasetInput(data, training)])
         origin = {"dataset_name": data.name, "dataset_digest": data.digest}
-    if model_id := log_model(client, experiment, run_id, run):
+    if model_id := registry.log_model(client, experiment, run_id, run):
         origin["model_id"] = model_id
     # Metrics of the finished run, then of each epoch.
-    metrics = [
-        Metric(name, value, run.end_ms, step, **origin)
-        for name, step, value in starmap(convert_metric, run.metrics.items())
-    ]
-    metrics += epoch_metrics(run.epochs, run.start_ms)
-    # MLflow takes 6000 characters of a param.
-    params = [Param(key, v[:6000]) for key, v in select_settings(run, tags["preset"]).items()]
-    log_metrics(client, run_id, metrics, params)
-    # Files that are not part of the model: tables, figures and settings.
-    with tempfile.TemporaryDirectory() as folder:
-        side_files = {k: v for k, v in run.files.items() if not k.startswith(run.model_prefix)}
-        link_files(side_files, Path(folder))
-        client.log_artifacts(run_id, folder)
-    client.log_text(run_id, as_yaml(run.config), CONFIG)
-    client.set_terminated(run_id, run.status, run.end_ms)
+    log_metrics(client, run_id, [(0, end_ms, {**run.metrics, **run.best_validation})], **origin)
+    log_metrics(client, run_id, list_epochs(run.epochs, start_ms))
+    # All settings are parameters; MLflow takes 100 at once, with 6000 characters of each.
+    texts = run.params | {"preset": tags["preset"]}
+    params = [Param(name, text[:6000]) for name, text in texts.items()]
+    for i in range(0, len(params), 100):
+        client.log_batch(run_id, params=params[i : i + 100])
+    # Files have the same names as in the results folder; the model holds the files of a fit.
+    for path in (*run.files, *(() if run.bundle else run.fit_files)):
+        client.log_artifact(run_id, str(path), str(path.parent.relative_to(run.root)))
+    has_failed = run.tags.get("status") == "failed"
+    client.set_terminated(run_id, "FAILED" if has_failed else "FINISHED", end_ms)
     # Last, so that a run without it is known to be incomplete.
     client.set_tag(run_id, "content_hash", run.content_hash)
     return run_id
 
 
+def list_epochs(epochs: Sequence[Row], start_ms: int) -> list[tuple[int, int, Row]]:
+    """Return number, time in ms since 1970, and errors of each epoch, named `epoch/NAME`.
+
+    Parameters
+    ----------
+    epochs : sequence of mappings
+        Rows of the history.
+    start_ms : int
+        Start of the training in ms since 1970.
+    """
+    # Other columns of the history are counters and times.
+    counters = ("epoch", "step", "seconds", "cpu_seconds")
+    rows = [{f"epoch/{k}": v for k, v in row.items() if k not in counters} for row in epochs]
+    times = [(int(row["epoch"]), start_ms + int(1000 * row["seconds"])) for row in epochs]
+    return [(*time, row) for time, row in zip(times, rows, strict=True)]
+
+
 def log_metrics(
-    client: MlflowClient, run_id: str, metrics: Sequence[Metric], params: Sequence[Param] = ()
+    client: MlflowClient, run_id: str, rows: Iterable[tuple[int, int, Row]], **origin: str
 ) -> None:
-    """Log finite metrics, and params; MLflow takes 1000 at once.
+    """Log finite metrics: a training that diverged has infinite errors, which no database takes.
 
     Parameters
     ----------
@@ -415,17 +363,22 @@ def log_metrics(
         Client of the database or server.
     run_id : str
         MLflow's id of the run.
-    metrics : sequence of Metric
-        Values with their steps; those that are not finite are left out.
-    params : sequence of Param
-        Settings of the run.
+    rows : iterable of (int, int, mapping)
+        Step, time in ms since 1970, and values by name.
+    **origin : str
+        Names of the data and of the model that all values are of.
     """
-    # A training that diverged has infinite errors, which no database takes.
-    finite = [metric for metric in metrics if math.isfinite(metric.value)]
-    # 100 of the 1000 may be params.
-    for i in range(max(len(finite) // 900, len(params) // 100) + 1):
-        rows = finite[900 * i : 900 * (i + 1)], params[100 * i : 100 * (i + 1)]
-        client.log_batch(run_id, *rows, synchronous=True)
+    from mlflow.entities import Metric
+
+    metrics = [
+        Metric(name, value, time_ms, step, **origin)
+        for step, time_ms, row in rows
+        for name, value in starmap(tracking.convert_metric, row.items())
+        if math.isfinite(value)
+    ]
+    # MLflow takes 1000 at once.
+    for i in range(0, len(metrics), 1000):
+        client.log_batch(run_id, metrics[i : i + 1000])
 
 
 def make_tags(run: TrackedRun) -> dict[str, str]:
@@ -444,26 +397,57 @@ def make_tags(run: TrackedRun) -> dict[str, str]:
         Tags of `SLOT`, of the run itself, and the hash of its settings.
     """
     # The preset is a tag of the whole import.
-    slot = {key: getattr(run, key) for key in SLOT if key != "preset"}
-    return {**slot, **run.tags, "config_hash": run.config_hash, "superseded": "false"}
+    slot = {**dict(zip(KEY, run.key, strict=True)), "source": run.source}
+    hashes = {"config_hash": run.config_hash, "validation": run.validation_hash}
+    return {**slot, **run.tags, **hashes, "superseded": "false"}
 
 
-def is_external_error(error: Exception) -> bool:
-    """Return True if an error comes from the database, the server or the disk, not from a bug.
+def logger(checkpoint: Path) -> Callable[[Row], None]:
+    """Return a function that logs an epoch of the training with this checkpoint.
+
+    Trainings that MLflow does not show, such as points of sweeps, are not logged, nor are trainings
+    on a cluster unless MLFLOW_TRACKING_URI names a server: nodes of a cluster do not open the
+    database.
 
     Parameters
     ----------
-    error : Exception
-        Error of an import.
+    checkpoint : Path
+        File of the training's state, whose path in the results folder names the training.
+
+    Returns
+    -------
+    callable
+        Function of a row of the history: epoch, seconds and errors. An MLflow that fails does not
+        stop the training.
     """
-    # MLflow raises its own errors, and errors of its database and of files.
-    from mlflow.exceptions import MlflowException
-    from sqlalchemy.exc import SQLAlchemyError
+    database = Path(os.environ["PSFDAE_RESULTS"], "mlflow.db")
+    # Checkpoints are METHOD/DATASET/SPLIT-REFERENCE.pt and, of scene 3, alignment-NETWORK.pt.
+    source = os.path.relpath(checkpoint.with_suffix(""), database.with_name("checkpoints"))
+    source = source.replace("alignment-", "alignment/")
+    is_shown = bool(server() or "SLURM_JOB_ID" not in os.environ) and "/" in source
+    # MLflow's id of the run, and the last epoch that it has; "" before the first one.
+    run_id, last_epoch = "", 0.0
 
-    # Any other error is a mistake of this program, and is not hidden.
-    return isinstance(error, MlflowException | SQLAlchemyError | OSError)
+    def log(row: Row) -> None:
+        nonlocal is_shown, run_id, last_epoch
+        # Not shown from the start, or since MLflow has failed.
+        if not is_shown:
+            return
+        # The history counts seconds from the start of the training, MLflow from 1970.
+        start_ms = int(1000 * (time.time() - row["seconds"]))
+        try:
+            with open_mlflow(database) as client:
+                if row["epoch"] <= last_epoch or not run_id:
+                    # A training that starts again, or resumes from its checkpoint, has a new run,
+                    # without which the run of an earlier attempt would remain.
+                    delete_live(client, source)
+                    tags = {"source": source, "preset": os.environ["PRESET"] or "fast"}
+                    live = find_experiment(client, LIVE)
+                    run_id = client.create_run(live, start_ms, tags, source).info.run_id
+                log_metrics(client, run_id, list_epochs([row], start_ms))
+                last_epoch = row["epoch"]
+        except TrackingError as error:
+            is_shown = False  # errors of MLflow must not stop a training
+            print(f"the training is not shown in MLflow any more: {error}", flush=True)
 
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error."""
-    return str(error).strip().split("\n", 1)[0]
+    return log

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from fnmatch import fnmatch
 from itertools import combinations, product
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from command_line import printed, psfdae, refused
 from docs_pages import ROOT
 from psfdae.base.files import write_text
-from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation import comparison, record_tables
 from psfdae_paper.evaluation.comparison import (
     compare_evaluations,
     measure_held_out_ratios,
@@ -154,6 +156,84 @@ def test_tables_of_a_run_and_of_the_record_are_compared(recorded, scale, lines):
     assert "12 mean errors are in both (A has 12, B 24)" in result.output
     assert all(line in result.output for line in lines)
     assert ("NOT COMPARABLE" in result.output) == ("n" in scale)
+
+
+NO_VALUES = {
+    *("runtime.csv", "sweeps/dae_crop/cost.csv", "sweeps/network_epochs/cost.csv"),
+    *("tables/benchmark_inference.csv", "tables/benchmark_machine.csv"),
+    "tables/predict_throughput.csv",
+}
+"""Tables of the record that hold nothing but times, memory, and verdicts on them."""
+
+
+def spoil(folder, factor):
+    """Write all tables of the record with all values, but not their keys, times a factor."""
+    for name in record_tables.list_tables(RECORD):
+        table = pd.read_csv(RECORD / name, dtype=str, keep_default_na=False)
+        keys, _ = record_tables.find_rule(name, table)
+        for column in table.columns.difference(keys):
+            numbers = factor * pd.to_numeric(table[column], errors="coerce")
+            table[column] = table[column].mask(numbers.notna(), numbers.map("{:.9g}".format))
+        write_text(folder / name, table.to_csv(index=False))
+
+
+def list_differing(run):
+    """The tables that a comparison with the record names, and its output."""
+    output = printed("paper", "compare", run, RECORD)
+    return {line.split("**")[1] for line in output.splitlines() if "- **" in line}, output
+
+
+def test_each_table_spoilt_by_a_factor_is_named(tmp_path):
+    names = record_tables.list_tables(RECORD)
+    # Every CSV of the record is compared, each with keys of its own.
+    assert names == {p.relative_to(RECORD).as_posix() for p in RECORD.rglob("*.csv")}
+    assert not [
+        name
+        for name in names
+        if not any(fnmatch(name, pattern) for pattern in record_tables.TABLES)
+    ]
+    spoil(tmp_path, 5.0)
+    differing, output = list_differing(tmp_path)
+    assert differing == names - NO_VALUES - {"tables/psf_metrics.csv"}
+    # Mean errors have a section of their own.
+    assert "- 0 are equal" in output and "dataset8, random, realisation: noisy at" in output
+    assert "grid, 0, constant, decenter_x, m: mean_abs_error 0.003 (A), 0.0006 (B)" in output
+
+
+def test_tables_within_their_scatter_are_not_named(tmp_path):
+    shutil.copytree(RECORD, tmp_path / "run")
+    run = tmp_path / "run"
+    differing, output = list_differing(run)
+    count = len(record_tables.list_tables(RECORD)) - 1
+    assert f"{count} further tables are in both; {count} are equal" in output
+    assert differing == set()
+    # 2 % of scene 3 and of the bounds, whose standard errors are about 5 %; then 40 %.
+    for name, column in (("alignment_errors", "mean_abs_error"), ("psf_bounds_growth", "mse")):
+        path = run / f"tables/{name}.csv"
+        table = pd.read_csv(path)
+        for factor, verdict in ((1.02, "within"), (1.4, "beyond")):
+            table.assign(**{column: factor * table[column]}).to_csv(path, index=False)
+            values = record_tables.compare_values(run, RECORD, f"tables/{name}.csv")
+            assert set(values.verdict) == {"equal", verdict}
+            assert set(values.column[values.verdict == verdict]) == {column}
+        shutil.copy(RECORD / f"tables/{name}.csv", path)
+    # Rows that only one of the runs has; a table that only the record has.
+    path = run / "tables/alignment_errors.csv"
+    pd.read_csv(path).iloc[3:].to_csv(path, index=False)
+    (run / "tables/stability.csv").unlink()
+    _, output = list_differing(run)
+    assert "alignment_errors.csv**: 0 of 999 values" in output
+    assert "3 rows are in one alone" in output and "Not in A: tables/stability.csv" in output
+
+
+def test_a_table_without_an_entry_is_compared_by_its_texts(tmp_path):
+    for folder, error in (("a", 1.0), ("b", 3.0)):
+        table = pd.DataFrame({"name": ["x", "y"], "error": [error, 1.0], "time_s": [error, 2.0]})
+        write_text(tmp_path / folder / "tables/new.csv", table.to_csv(index=False))
+    values = record_tables.compare_values(tmp_path / "a", tmp_path / "b", "tables/new.csv")
+    assert values.query("verdict != 'equal'")[["row", "column"]].to_numpy().tolist() == [
+        ["x", "error"]
+    ]
 
 
 def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():

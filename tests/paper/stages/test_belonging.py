@@ -114,7 +114,8 @@ def test_bounds_need_stars_of_the_scene_of_their_templates(at):
 def test_runs_are_tracked_with_their_own_stars(at, tmp_path):
     shutil.copytree(at / "dae", tmp_path / "dae/dataset3/random-realisation")
     (tmp_path / "evaluation/dataset3").mkdir(parents=True)
-    (tmp_path / "evaluation/dataset3/random-realisation.csv").write_text("method\ndae\n")
+    rows = "method,noise_level,metric,value,stderr\ndae,0.003,mse,1e-5,1e-7\n"
+    (tmp_path / "evaluation/dataset3/random-realisation.csv").write_text(rows)
     words = ("track", "--results", tmp_path, "--preset=smoke", "--stars", "dataset3", at / "s2.h5")
     out = ("--database", tmp_path / "mlflow.db", "--out", tmp_path / "out.csv")
     file = tmp_path / "dae/dataset3/random-realisation/trained_on.yaml"

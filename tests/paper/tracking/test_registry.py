@@ -1,16 +1,20 @@
-"""Registered models restore stamps as bundles of the same fits do."""
+"""Registered models restore stamps as bundles of the same fits do, in Python and as JSON."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from functools import partial
 
 import numpy as np
+import pytest
 
 from image_training import few_draws
 from psfdae import load_model
-from psfdae.base.files import Column, write_product
+from psfdae.base.files import Column, write_product, write_text
+from psfdae.base.version import __version__
 from psfdae.methods import fit_files as fits
 from psfdae.methods import list_groups, method
+from psfdae_paper import tracking
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle, track
 from psfdae_paper.stages.evaluate import Models
@@ -27,6 +31,8 @@ def test_a_registered_model_restores_as_its_bundle_does(
     tmp_path, gaussian_stars, empty_database, monkeypatch
 ):
     import mlflow
+    from mlflow.exceptions import MlflowException
+    from mlflow.pyfunc.scoring_server import infer_and_parse_data
 
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
@@ -45,21 +51,43 @@ def test_a_registered_model_restores_as_its_bundle_does(
     with few_draws():
         bundle.bundle(config, stars, Models(dae=place), out=packed)
 
-    files = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
+    source = tmp_path / "evaluation/mine/random-realisation.csv"
+    write_text(source, "")
+    place_of_run = (tmp_path, "trials", "fit", ("dae", "mine", "random", "realisation"))
+    bundle_of_fit = partial(tracking.make_bundle, kind, place, stars, "realisation", "mine-dae")
     run = TrackedRun(
-        "dae", "mine", "random", "realisation", "fit", "a fit", "trials", files, {}, stars
+        *place_of_run,
+        kind.read_config(place),
+        fits.own_files(kind, place),
+        [place / "history.csv"],
+        data=stars,
+        bundle=bundle_of_fit,
     )
-    run = replace(run, metrics={"test_mse": 1e-5}, data=stars, fit=(kind, place))
     database = tmp_path / "mlflow.db"
     database.write_bytes(empty_database.read_bytes())
     track.import_runs([run], "smoke", database, tmp_path / "runs.csv")
     tracking_uri = mlflow.get_tracking_uri()
     mlflow.set_tracking_uri(f"sqlite:///{database}")
     try:
-        folder = mlflow.artifacts.download_artifacts("models:/mine-dae@best")
+        served = mlflow.pyfunc.load_model("models:/mine-dae@best")
     finally:
         mlflow.set_tracking_uri(tracking_uri)
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
     stamps = np.random.default_rng(5).poisson(2e4 * gaussian_stars[:20] + 1e4).astype(np.float32)
-    registered, model = load_model(f"{folder}/mine-dae.psf.safetensors"), load_model(packed)
-    np.testing.assert_array_equal(registered.predict(stamps).psf, model.predict(stamps).psf)
+    expected = load_model(packed).predict(stamps).psf
+    np.testing.assert_array_equal(served.predict(stamps), expected)
+    # As JSON, a stamp is what a served model gets.
+    schema, text = served.metadata.get_input_schema(), json.dumps({"inputs": stamps[:1].tolist()})
+    (stamp,) = infer_and_parse_data(json.loads(text), schema)
+    np.testing.assert_allclose(served.predict(stamp[None]), expected[:1], rtol=1e-5, atol=1e-3)
+    assert served.predict(served.input_example).shape == (1, 16, 16)
+    folder = database.with_name("mlartifacts")
+    (model_file,) = folder.rglob("MLmodel")
+    requirements = (model_file.parent / "requirements.txt").read_text().splitlines()
+    assert f"psfdae[dae]=={__version__}" in requirements
+    # Small: the bundle, and some kilobytes of text about it.
+    size = sum(path.stat().st_size for path in model_file.parent.rglob("*") if path.is_file())
+    assert 0 < size - packed.stat().st_size < 30_000
+    with pytest.raises(MlflowException, match="expected shape"):
+        served.predict(stamps[:, :8])

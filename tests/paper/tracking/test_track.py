@@ -3,75 +3,117 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import socket
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import yaml
 
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import read_dataset_runs
-from tracked_results import write_config, write_history, write_stars, write_tree
+from tracked_results import ALL, write_config, write_history, write_stars, write_tree
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_run_holds_what_the_files_say(site):
-    assert site.track() == {"dae": "created", "pca_som": "created"}
-    (dae,), (baseline,) = site.runs("dae"), site.runs("pca_som")
+    assert site.track() == dict.fromkeys(ALL, "created")
+    (dae,), (baseline,), (noisy,) = map(site.runs, ("dae", "pca_som", "noisy"))
     assert (dae.info.run_name, dae.info.status) == ("dae dataset3 random template", "FINISHED")
     # The duration is that of the job, or else of the training.
-    durations = [run.info.end_time - run.info.start_time for run in (dae, baseline)]
-    assert durations == [4500, 12500]
-    # Those settings are shown that differ from the preset's, and those of dataset and method.
-    assert dae.data.params == {
-        **{"method": "dae", "split": "random", "reference": "template", "seed": "7"},
-        **{"dae.widths": "[4, 4]", "train.lr": "0.001"},
-        **{"parts.train_stars": "30", "parts.test_stars": "10"},
-        **{"stars.name": "seidel_10pct", "noise.name": "noise3", "noise.levels": "[0.003]"},
-    }
-    assert baseline.data.metrics["test_mse_1e-6"] == pytest.approx(20)
-    metrics = {"test_mse_1e-6": 30, "best_validation_mse_1e-6": 10, "epoch/lr": 1e-3}
-    metrics |= {"lambda_1e-6/test_ssim": 0.3, "lambda_1e-6/test_mse_stderr_1e-6": 0.1}
+    durations = [run.info.end_time - run.info.start_time for run in (dae, baseline, noisy)]
+    assert durations == [4500, 12500, 0]
+    # All settings are shown, of the stars, too, and none that is a result.
+    key = {"dataset": "dataset3", "split": "random", "reference": "template", "preset": "smoke"}
+    seen = {"seed": "7", "noise.levels": "[0.003]", "parts.train_stars": "30"}
+    stars = {"stars.name": "seidel_10pct", "telescope.diameter_m": "1.0"}
+    own = {"kind": "dae", "dae.widths": "[4, 4]", "train.lr": "0.001"}
+    assert {**key, **seen, **stars, **own}.items() <= dae.data.params.items()
+    assert {**key, **seen, **stars, "kind": "noisy"}.items() <= noisy.data.params.items()
+    assert baseline.data.params["baseline.components"] == "2"
+    assert "attempt" not in dae.data.params and "train.lr" not in noisy.data.params
+    means = [run.data.metrics["test_mse_1e-6"] for run in (noisy, baseline, dae)]
+    assert means == pytest.approx([10, 20, 30])
+    metrics = {"test_mse_1e-6": 30, "test_mse_1e-6/0.003": 30, "test_ssim/0.003": 0.3}
+    metrics |= {"test_mse_stderr_1e-6/0.003": 0.1, "best_validation_mse_1e-6": 10}
+    metrics |= {"epoch/lr": 1e-3}
     for name, value in metrics.items():
         assert dae.data.metrics[name] == pytest.approx(value)
-    for name, expected in (
-        ("epoch/train_mse_1e-6", [(1, 30), (2, 20), (3, 10)]),
-        ("lambda_1e-6/test_mse_1e-6", [(3000, 30)]),
-    ):
-        points = [(p.step, p.value) for p in site.history(dae, name)]
-        assert points == [pytest.approx(point) for point in expected]
+    points = [(p.step, p.value) for p in site.history(dae, "epoch/train_mse_1e-6")]
+    assert points == [pytest.approx(point) for point in [(1, 30), (2, 20), (3, 10)]]
     (dataset_input,) = dae.inputs.dataset_inputs
     digest = hashlib.sha256(site.stars["dataset3"].read_bytes()).hexdigest()
     assert dataset_input.dataset.name == "dataset3" and digest.startswith(
         dataset_input.dataset.digest
     )
-    # Copies of the files lie beside the database.
+    assert "data/seidel/stars.h5" in dataset_input.dataset.source
+    assert str(site.results) not in dataset_input.dataset.source
+    # Copies of the files lie beside the database, by their names in the results folder.
     artifacts = site.results / "mlartifacts/scene1"
     copies = artifacts / dae.info.run_id / "artifacts"
-    for name in ("config.yaml", "evaluation.csv", "figures/random-template_strip.png"):
-        assert (copies / name).is_file()
-    assert not (copies / "figures/held_out-template_strip.png").exists()
-    model = f"models/{dae.outputs.model_outputs[0].model_id}/artifacts"
-    assert (artifacts / model / "dae.safetensors").read_bytes() == b"weights"
+    names = ("evaluation/dataset3/random-template.csv", "figures/dataset3/curves.png")
+    for name in (*names, "dae/dataset3/random-template/history.csv"):
+        assert (copies / name).read_bytes() == (site.results / name).read_bytes()
+    fit = artifacts / baseline.info.run_id / "artifacts/pca_som/dataset3/random.h5"
+    assert fit.read_bytes() == (site.results / "pca_som/dataset3/random.h5").read_bytes()
+    # The model is there once, as its bundle.
+    assert not list(artifacts.rglob("dae.safetensors"))
+    (model,) = artifacts.rglob("*.psf.safetensors")
+    assert dae.outputs.model_outputs[0].model_id in model.parts
 
 
-def test_best_is_the_version_that_errs_least_of_the_present_results(site):
-    def best():
-        version = site.client.get_model_version_by_alias("dataset3-dae", "best")
-        return site.client.get_run(version.run_id).data
+def test_best_has_the_smallest_validation_error_on_the_same_stars(site):
+    """Test errors choose nothing; other noise makes another task."""
 
-    site.track()
-    # No bundle holds a baseline.
-    assert len(site.client.search_registered_models()) == 1
-    assert best().metrics["test_mse_1e-6"] == pytest.approx(30)
-    write_config(site.dae / "config.yaml", lr=0.01)  # errs as much, and is the present one
-    site.track()
-    assert best().params["train.lr"] == "0.01"
-    shutil.copytree(site.dae, site.dae.with_name("random-realisation"))
+    def best(alias="best-random-template"):
+        version = site.client.get_model_version_by_alias("dataset3-dae", alias)
+        return site.client.get_run(version.run_id).data.params["train.lr"]
+
     table = site.results / "evaluation/dataset3/random-template.csv"
-    text = table.read_text().replace("template", "realisation").replace("3e-05", "4e-05")
+    text = table.read_text()
+    # Learning rate, validation error and test error of runs one after the other.
+    for lr, validation, test, winner in (
+        (0.001, 1e-5, "3e-05", "0.001"),
+        (0.002, 3e-5, "1e-05", "0.001"),
+        (0.003, 5e-6, "9e-05", "0.003"),
+    ):
+        write_config(site.dae / "config.yaml", lr=lr)
+        write_history(site.dae / "history.csv", [(1, 3e-5, validation, 1.5)])
+        table.write_text(text.replace("dae,0.003,mse,3e-05", f"dae,0.003,mse,{test}"))
+        site.track()
+        assert best() == winner
+    # No bundle holds a baseline.
+    (model,) = site.client.search_registered_models()
+    assert model.aliases.keys() == {"best-random-template"}
+    # Only runs with the noise of the present results compete.
+    tree = yaml.safe_load((site.dae / "config.yaml").read_text())
+    tree["train"]["lr"], tree["noise"]["levels"] = 0.004, [0.005]
+    (site.dae / "config.yaml").write_text(yaml.safe_dump(tree))
+    write_history(site.dae / "history.csv", [(1, 3e-5, 8e-5, 1.5)])
+    site.track()
+    assert best() == "0.004"
+    # Each reference has its own best run, "best" alone is for realisations of a random split.
+    shutil.copytree(site.dae, site.dae.with_name("random-realisation"))
+    text = table.read_text().replace("template", "realisation")
     table.with_name("random-realisation.csv").write_text(text)
-    site.track()  # errors to templates do not compete with errors to realisations
-    assert best().tags["reference"] == "realisation"
+    copy = table.with_name("random-realisation.h5")
+    shutil.copy(table.with_suffix(".h5"), copy)
+    site.track()
+    (model,) = site.client.search_registered_models()
+    assert len(set(model.aliases.values())) == len(model.aliases) == 2
+    assert best("best") == "0.004"
+
+
+def test_a_method_without_a_validation_error_has_no_best(site):
+    write_history(site.dae / "history.csv", [(1, 3e-5, "nan", 1.5)])
+    site.track()
+    (model,) = site.client.search_registered_models()
+    assert not model.aliases and len(site.client.search_model_versions()) == 1
 
 
 def test_changed_files_replace_a_run_and_another_config_supersedes_it(site):
@@ -81,20 +123,21 @@ def test_changed_files_replace_a_run_and_another_config_supersedes_it(site):
     site.track()
     runs_before = site.rows(), [run.to_dictionary() for run in site.runs()]
     (site.dae / "dae.safetensors").touch()
-    assert site.track() == {"dae": "unchanged", "pca_som": "unchanged"}
+    assert site.track() == dict.fromkeys(ALL, "unchanged")
     assert (site.rows(), [run.to_dictionary() for run in site.runs()]) == runs_before
     write_history(site.dae / "history.csv", [(1, 5e-5, 4e-5, 2.0), (2, 4e-5, 6e-5, 3.0)])
-    assert site.track() == {"dae": "updated", "pca_som": "unchanged"}
+    assert site.track() == dict.fromkeys(ALL, "unchanged") | {"dae": "updated"}
     (run,) = site.runs()
-    assert [p.value for p in site.history(run, "epoch/train_mse_1e-6")] == pytest.approx([50, 40])
+    points = site.history(run, "epoch/train_mse_1e-6")
+    assert [point.value for point in points] == pytest.approx([50, 40])
     (version,) = site.client.search_model_versions()
     first = run.info.run_id
     assert version.run_id == first
     write_config(site.dae / "config.yaml", lr=0.006)
-    assert site.track() == {"dae": "created", "pca_som": "unchanged"}
+    assert site.track() == dict.fromkeys(ALL, "unchanged") | {"dae": "created"}
     assert superseded().pop(first) == "true" and len(superseded()) == 2
     write_config(site.dae / "config.yaml")
-    assert site.track() == {"dae": "unchanged", "pca_som": "unchanged"}
+    assert site.track() == dict.fromkeys(ALL, "unchanged")
     assert superseded().pop(first) == "false"
     assert sorted(superseded().values()) == ["false", "true"]
 
@@ -109,10 +152,10 @@ def test_killed_import_is_repaired(site, monkeypatch):
         patch.setattr(MlflowClient, "log_model_artifacts", killed)
         with pytest.raises(KeyboardInterrupt):
             site.track()
-    assert len(site.runs("pca_som")) + len(site.runs("dae")) == 1
+    assert {run.info.status for run in site.runs("dae")} == {"RUNNING"}
     site.track()
-    runs = site.runs("pca_som") + site.runs("dae")
-    assert [run.info.status for run in runs] == ["FINISHED", "FINISHED"]
+    runs = [run for kind in ALL for run in site.runs(kind)]
+    assert [run.info.status for run in runs] == ["FINISHED"] * 3
     assert len(site.client.search_model_versions()) == 1
 
 
@@ -121,31 +164,63 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys):
         server.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{server.getsockname()[1]}"
         monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
-        assert site.track() == {"dae": "not sent", "pca_som": "not sent"}
+        assert site.track() == dict.fromkeys(ALL, "not sent")
     out = capsys.readouterr().out
     assert address in out
-    assert "pca_som dataset3 random template, dae dataset3 random template" in out
+    assert "Not sent: " + ", ".join(f"{kind} dataset3 random template" for kind in ALL) in out
 
 
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     stars = write_tree(tmp_path)
-    _, first = read_dataset_runs(tmp_path, stars)
-    config, content_hash = first.files["model/config.yaml"], first.content_hash
+    first = read_dataset_runs(tmp_path, stars)[2]
+    config, content_hash = first.fit_files[1], first.content_hash
     tree = yaml.safe_load(config.read_text())
     config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
-    attempt = read_dataset_runs(tmp_path, stars)[1]
+    attempt = read_dataset_runs(tmp_path, stars)[2]
     assert attempt.config_hash == first.config_hash
     assert attempt.content_hash != content_hash
     write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
-    assert read_dataset_runs(tmp_path, stars)[1].config_hash != first.config_hash
+    assert read_dataset_runs(tmp_path, stars)[2].config_hash != first.config_hash
 
 
-def test_moved_results_and_a_damaged_database_are_refused(site):
+def test_moved_results_still_open(site):
+    """Names of files in the database name no folder, so that a program opens a copy of it."""
     site.track()
+    with sqlite3.connect(site.database) as connection:
+        assert str(site.results) not in "".join(connection.iterdump())
     site.results = site.results.rename(site.results.with_name("moved"))
     site.database = site.results / "mlflow.db"
     site.stars = {"dataset3": site.results / "data/seidel/stars.h5"}
-    with pytest.raises(track.TrackingError, match="moved"):
+    # In a process of its own, because MLflow remembers where files were. It registers the entry
+    # point as MLflow does for an installed package, whose metadata may be older than these sources.
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (entry_point,) = project["entry-points"]["mlflow.artifact_repository"].items()
+    code = f"""if True:
+        import pkgutil
+
+        import mlflow
+        from mlflow.store.artifact import artifact_repository_registry as registry
+
+        scheme, name = {entry_point}
+        registry.get_registered_artifact_repositories()[scheme] = pkgutil.resolve_name(name)
+        print(mlflow.pyfunc.load_model("models:/dataset3-dae@best-random-template").input_example)
+        run, = mlflow.search_runs(experiment_names=["scene1"], filter_string="tags.kind = 'noisy'",
+                                  output_format="list")
+        uri = run.info.artifact_uri + "/evaluation/dataset3/random-template.csv"
+        print(mlflow.artifacts.load_text(uri))
+    """
+    variables = {**os.environ, "MLFLOW_TRACKING_URI": f"sqlite:///{site.database}"}
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=variables, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "dataset3,random,template,noisy,0.003,mse" in run.stdout
+    assert site.track() == dict.fromkeys(ALL, "unchanged")
+
+
+def test_a_database_of_an_earlier_version_and_a_damaged_one_are_refused(site):
+    site.client.create_experiment("scene1", artifact_location=site.results.as_uri())
+    with pytest.raises(track.TrackingError, match="earlier version"):
         site.track()
     site.database.write_bytes(b"no database" * 100)
     with pytest.raises(track.TrackingError, match=r"mlflow\.db: .*delete it"):
