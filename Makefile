@@ -5,6 +5,7 @@
 #   RESULTS=folder   of this run, whose PRESET and SET it keeps (default: results, or results/PRESET)
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
 #   IMAGES="…"       images of `make night`: a pattern such as night/*.fits, or a CSV list
+#   FILE=run.tar     archive of a run that `make archive` writes and `make fetch` unpacks
 #   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
 #   TRACK=live       shows trainings in MLflow while they run (default: once they are finished)
@@ -12,7 +13,7 @@
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
 #   PART=k/n         the k-th of n parts of `make nightly` (default: all of it)
 #   PYTHONS="…", RESOLUTION=…  of `make test-pythons` (CONTRIBUTING.md)
-GIVEN := CORES PRESET SET RESULTS TARGETS IMAGES AGAINST PORT TRACK TORCH_INDEX PYTHON PART PYTHONS RESOLUTION
+GIVEN := CORES PRESET SET RESULTS TARGETS IMAGES FILE AGAINST PORT TRACK TORCH_INDEX PYTHON PART PYTHONS RESOLUTION
 
 # What a user gives reaches the recipes through the environment, unchanged: neither make nor a shell
 # expands a text that may come from a colleague's file.
@@ -69,6 +70,12 @@ night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list 
 
 report: env ## Gather the figures of a finished run in results/report.html
 	@sh workflow/report.sh $(SNAKEMAKE)
+
+archive: report ## A finished run as one file, FILE=run.tar: results, models, report, checksums, citation
+	psfdae paper archive "$$PSFDAE_RESULTS" --out "$${FILE:-psfdae-run.tar}"
+
+fetch: env ## Unpack and verify FILE=run.tar in place of computing it
+	psfdae paper fetch "$${FILE:-psfdae-run.tar}" --results "$$PSFDAE_RESULTS"
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f "$$PSFDAE_RESULTS/mlflow.db" || { echo "no $$PSFDAE_RESULTS/mlflow.db yet: make reproduce"; exit 1; }

@@ -296,6 +296,14 @@ def alignment():
     config = compose(Alignment.choice)
     telescope = tables.read_record("tables/alignment_telescope.csv").set_index("quantity").value
     yield f"its detector lies {telescope['defocus_centre']:.2f} waves RMS beyond focus"
+    # Distance of the stamps of a state and its twin, at the highest noise, in focus and beyond.
+    twins = tables.read_record("tables/alignment_twin.csv").query("position == -1")
+    level, defocus_mm = twins.noise_level.max(), 1e3 * config["alignment"]["defocus_m"]
+    at_level = twins[twins.noise_level == level]
+    in_focus, beyond = (
+        at_level[np.isclose(at_level.defocus_mm, mm)].chi2.item() ** 0.5 for mm in (0.0, defocus_mm)
+    )
+    yield f"at λ = {level:g} they differ by {in_focus:.1f} σ in focus, and by {beyond:.1f} σ there"
     fit, states = config["fit"], config["alignment"]["train_states"]
     yield f"nearest {fit['neighbours']} of {states:,} training states"
     yield f"{fit['outer_states']} states beyond the range"

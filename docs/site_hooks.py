@@ -18,6 +18,7 @@ from page_tables import insert_tables  # noqa: E402
 PUBLISHED = (
     *("*.md", "LICENSE", "CITATION.cff", "config/*.md"),
     *("docs/*.md", "docs/*.ipynb", "docs/*.css", "docs/*.js", "docs/figures/*.png"),
+    "docs/trained_kernel.py",
     *("results/reference/**/*.png", "results/reference/**/*.csv", "studies/*/*.csv"),
     "src/psfdae_paper/configuration/schema.py",
 )

@@ -1,4 +1,4 @@
-"""Hash of the code of a stage, by which a workflow detects that it has changed; git commit.
+"""Hash of the code of a stage, by which a workflow detects that it has changed; commit, machine.
 
 The hash covers commands, modules or programs, and all code of the packages that they import. A rule
 of the workflow has it among its parameters, so that a job runs again when the hash has changed.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
+import platform
 import subprocess
 from collections.abc import Iterator
 from functools import cache
@@ -168,3 +170,19 @@ def git(*arguments: str) -> str:
     """
     command = ["git", "-C", str(SOURCES.parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def describe_machine() -> str:
+    """Return processor, number of cores and version of Python of this machine."""
+    return f"{cpu_model()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def cpu_model() -> str:
+    """Return the model of the processor as the operating system names it."""
+    # A file of Linux; elsewhere Python asks the system.
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

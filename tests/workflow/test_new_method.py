@@ -1,10 +1,12 @@
 """Additions of one's own: how many files a method, a stage or a dataset takes.
 
-A method is a class, its settings, and a name in the list, and it is everywhere.
+A method is a class, its settings, and a name in the list, and it is everywhere. So is the method of
+docs/developers.md, which learns.
 """
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 
@@ -13,7 +15,7 @@ import pytest
 import yaml
 from astropy.io import fits
 
-from workflow_runs import copy_of_sources, environment, planned, snakemake
+from workflow_runs import ROOT, copy_of_sources, environment, planned, snakemake
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -100,15 +102,17 @@ SWEEP = {
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
-    """The sources with the toy in them."""
+    """The sources with the toy and the page's method in them."""
     root = copy_of_sources(tmp_path_factory.mktemp("tree"))
-    (root / "src/psfdae_paper/methods/shrunk.py").write_text(CLASS)
+    methods = root / "src/psfdae_paper/methods"
+    (methods / "shrunk.py").write_text(CLASS)
+    shutil.copy(ROOT / "docs/trained_kernel.py", methods / "kernel.py")
     (root / "config/shrunk").mkdir()
     (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
     path = root / "config/config.yaml"
     text = path.read_text()
     assert text.count("gmm_position]") == 1
-    path.write_text(text.replace("gmm_position]", "gmm_position, shrunk]"))
+    path.write_text(text.replace("gmm_position]", "gmm_position, shrunk, kernel]"))
     (root / "config/sweep/tried.yaml").write_text(yaml.safe_dump({"tried": SWEEP}))
     return root
 
@@ -118,6 +122,7 @@ def run(tree, tmp_path_factory):
     """Folder of a tiny run of dataset 3 and of the sweep."""
     folder = tmp_path_factory.mktemp("run")
     wanted = ("mlflow/dataset3.csv", "tables/psf_metrics.csv", "mlflow/sweep_tried.csv")
+    wanted += ("figures/dataset3/curves.png",)
     bundles = [f"bundles/dataset3-random-{ref}-shrunk.psf.safetensors" for ref in REFERENCES]
     targets = [f"results/{name}" for name in (*wanted, *bundles, "tables/from_stars.csv")]
     snakemake(folder, *targets, root=tree, overrides="workflow.datasets=[dataset3]")
@@ -143,6 +148,7 @@ def test_toy_is_in_the_tables_of_metrics(run):
     assert set(toy_rows["reference"]) == set(REFERENCES)
     assert set(toy_rows["split"]) == {"random", "held_out"}
     assert len(toy_rows) == len(table[table["method"] == "dae"])
+    assert (table["method"] == "kernel").sum() == len(toy_rows)
     table = pd.read_csv(run / "results/tables/from_stars.csv")
     assert {"noisy", "pca_som", "dae", "shrunk"} <= set(table["method"])
 
@@ -151,6 +157,7 @@ def test_toy_is_swept_and_its_runs_are_in_mlflow(run):
     names = ("dataset3", "sweep_tried")
     runs = pd.concat(pd.read_csv(run / f"results/mlflow/{name}.csv") for name in names)
     assert runs["source"].str.startswith(("shrunk/", "sweeps/tried")).sum() >= 4 + 3
+    assert runs["source"].str.startswith("kernel/").sum() == 4
     summary = pd.read_csv(run / "results/sweeps/tried/summary.csv")
     assert summary["shrunk.weight"].tolist() == [0.0, 0.25, 1.0]
     assert (summary["status"] == "finished").all() and summary["validation_mse"].nunique() == 3

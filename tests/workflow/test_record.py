@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import tarfile
 
 import pandas as pd
 import pytest
@@ -11,6 +14,8 @@ from docs_pages import ROOT
 from psfdae.base.files import ProductError
 from psfdae_paper import source
 from psfdae_paper.stages import record
+from psfdae_paper.stages.archive import ArchiveError, archive, fetch
+from psfdae_paper.stages.manifest import manifest
 
 REFERENCE = ROOT / "results/reference"
 SLOW = "paper/tables/psf_metrics.csv"
@@ -210,3 +215,107 @@ def test_alignment_of_the_run_of_record():
     assert learned[0.005] <= 0.06
     ratio = mean.loc["max_likelihood"] / mean.loc["cramer_rao"]
     assert 0.9 <= ratio[0.002] <= 1.15
+
+
+# A run as one file
+
+
+@pytest.fixture
+def archived(results, tmp_path):
+    """A finished run with a model, its report and its checksums, and the archive of it."""
+    written(results / "run.yaml", "preset: smoke\nset: ''\n")
+    written(results / "report.html", "<html></html>\n")
+    (results / "dae").mkdir()
+    (results / "dae/dae.safetensors").write_bytes(bytes(range(256)) * 40)
+    os.utime(results / "tables/t.csv", (1e9, 1e9))
+    manifest(results)
+    out = tmp_path / "run.tar"
+    archive(results, out)
+    return out
+
+
+def files_of(folder):
+    return {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_fetched_run_has_the_files_of_the_archived_one(archived, results, tmp_path):
+    fetch(archived, tmp_path / "fetched")
+    files = files_of(tmp_path / "fetched")
+    assert set(files) == {
+        *("run.yaml", "runtime.csv", "report.html", "CITATION.cff", "SHA256SUMS"),
+        *("tables/t.csv", "dae/dae.safetensors"),
+    }
+    for name in set(files) - {"CITATION.cff", "SHA256SUMS"}:
+        assert files[name].read_bytes() == (results / name).read_bytes()
+    assert files["CITATION.cff"].read_bytes() == (ROOT / "CITATION.cff").read_bytes()
+    # Snakemake compares times.
+    assert files["tables/t.csv"].stat().st_mtime == 1e9
+    # The same run gives the same bytes.
+    archive(results, tmp_path / "again.tar")
+    assert (tmp_path / "again.tar").read_bytes() == archived.read_bytes()
+    # A run that is there stays.
+    with pytest.raises(ArchiveError, match="exists; name a folder"):
+        fetch(archived, tmp_path / "fetched")
+
+
+def test_a_flipped_byte_is_named(archived, tmp_path):
+    content = bytearray(archived.read_bytes())
+    content[content.index(bytes(range(256))) + 7] ^= 1
+    archived.write_bytes(content)
+    with pytest.raises(ArchiveError, match=r"run\.tar: dae/dae\.safetensors: damaged"):
+        fetch(archived, tmp_path / "fetched")
+    assert not [*tmp_path.glob("*fetch*")]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.8, 0.95])
+def test_a_truncated_archive_leaves_nothing(archived, tmp_path, share):
+    content = archived.read_bytes().rstrip(b"\0")
+    archived.write_bytes(content[: int(share * len(content))])
+    before = {*tmp_path.iterdir()}
+    with pytest.raises(ArchiveError, match=r"run\.tar: "):
+        fetch(archived, tmp_path / "fetched")
+    assert {*tmp_path.iterdir()} == before
+
+
+def hostile_member(name, kind=tarfile.REGTYPE, target=""):
+    member = tarfile.TarInfo(name)
+    member.type, member.linkname = kind, target
+    return member
+
+
+@pytest.mark.parametrize(
+    ("member", "message"),
+    [
+        (hostile_member("/tmp/evil"), "wrong line"),
+        (hostile_member("../evil"), "wrong line"),
+        (hostile_member("tables/../../evil"), "wrong line"),
+        (hostile_member("evil", tarfile.SYMTYPE, "/etc/passwd"), "evil: not a plain file"),
+        (hostile_member("evil", tarfile.LNKTYPE, "SHA256SUMS"), "evil: not a plain file"),
+        (hostile_member("evil", tarfile.FIFOTYPE), "evil: not a plain file"),
+        (hostile_member("tables", tarfile.DIRTYPE), "tables: not a plain file"),
+        (hostile_member("SHA256SUMS"), "SHA256SUMS: has no checksum"),
+    ],
+)
+def test_a_hostile_archive_is_rejected(tmp_path, member, message):
+    """Every member has its checksum, but the last one of them."""
+    digest = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    listed = member.name if member.name != "SHA256SUMS" else "other"
+    sums = f"{digest}  {listed}\n".encode()
+    with tarfile.open(tmp_path / "run.tar", "w") as tar:
+        first = tarfile.TarInfo("SHA256SUMS")
+        first.size = len(sums)
+        tar.addfile(first, io.BytesIO(sums))
+        tar.addfile(member)
+    with pytest.raises(ArchiveError, match=message):
+        fetch(tmp_path / "run.tar", tmp_path / "fetched")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.tar"]
+
+
+def test_only_a_complete_and_undamaged_run_is_archived(archived, results, tmp_path):
+    (results / "dae/dae.safetensors").write_bytes(b"other")
+    with pytest.raises(ProductError, match=r"dae\.safetensors: differs from its checksum"):
+        archive(results, tmp_path / "other.tar")
+    (results / "report.html").unlink()
+    with pytest.raises(ProductError, match=r"report\.html: missing"):
+        archive(results, tmp_path / "other.tar")
+    assert not (tmp_path / "other.tar").exists()

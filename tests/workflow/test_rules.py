@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from psfdae.base.files import write_text
-from psfdae_paper.workflow import alignment, datasets, fits, night, run, sweeps
+from psfdae_paper.source import git_commit
+from psfdae_paper.workflow import alignment, datasets, fits, night, report, run, sweeps
 from psfdae_paper.workflow.run import (
     as_options,
     close_target,
@@ -66,6 +67,40 @@ def test_a_finished_run_gives_preset_and_overrides_that_the_command_line_lacks(
     # A night and a sweep have folders of their own, and leave the record alone.
     record_run(read_run({"preset": "smoke", "sweep": "gmm"}))
     assert read_run({"results": "results/smoke"}).overrides[1] == "seed=3"
+
+
+def test_the_report_says_which_run_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = read_run({"preset": "smoke", "set": "seed=3"})
+    assert report.describe_run(run)["commit"].startswith("not recorded")
+    record_run(run)
+    told = report.describe_run(run)
+    assert (told["preset"], told["overrides"]) == ("smoke", "seed=3")
+    assert told["commit"] == git_commit() and "cores" in told["machine"]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", told["date"])
+
+
+@pytest.mark.parametrize(
+    ("words", "data", "training"),
+    [
+        ({"preset": "paper"}, [], []),
+        ({"preset": "fast"}, [], ["train.epochs = 8 instead of 100"]),
+        ({"preset": "smoke"}, ["parts.train_stars = 192 instead of 6724"], ["dae.init = "]),
+        ({"preset": "paper", "set": "noise.kappa=5"}, ["noise.kappa = 5.0 instead of 4.98"], []),
+        ({"preset": "paper", "set": "train.threads=2"}, [], ["train.threads = 2 instead of 1"]),
+    ],
+)
+def test_differences_from_the_paper_are_named(words, data, training):
+    run = read_run(words)
+    differences = report.find_differences(run, "dataset3")
+    for expected, texts in ((data, differences["data"]), (training, differences["training"])):
+        assert bool(texts) == bool(expected)
+        assert all(any(text.startswith(start) for text in texts) for start in expected)
+    line = report.describe_differences(run, "dataset3")
+    assert ("ot the paper's data" in line) == bool(data)
+    assert ("ot the paper's training" in line) == bool(training)
+    warnings = report.group_warnings(run)
+    assert sum("dataset3" in names for names in warnings.values()) == bool(data or training)
 
 
 def test_another_run_stops_in_a_folder_that_nobody_named(tmp_path, monkeypatch):

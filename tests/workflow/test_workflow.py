@@ -164,6 +164,7 @@ def test_learning_rate_of_one_dataset_repeats_what_follows_from_it(jobs):
         "evaluate": 4,
         "paper_tables": 1,
         "psf_metrics": 1,
+        "methods_table": 1,
         "held_out": 1,
         "figure_curves": 1,
         "figure_errors": 1,

@@ -11,6 +11,7 @@ from psfdae.base.options import File
 from psfdae.base.reading import read_table
 from psfdae.commands.cli import program
 from psfdae_paper.configuration.command import command
+from psfdae_paper.evaluation.drawing import label_log_axis
 
 WAYS = {
     "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),
@@ -37,14 +38,14 @@ MARKS = {
     "knee": ("knee of the DAE's training", {**RING, "marker": "o", "ms": 17}),
     "used": ("training of the preset", {**RING, "marker": "s", "ms": 13}),
 }
-MSE, FLUX = "MSE of normalised stamps", "relative error of the flux, RMS"
+MSE, FLUX = "largest MSE of normalised stamps", "relative error of the flux, RMS"
 HOT = "excess of the pixel over the star's flux"
-# Title, x and y axes, place of the legend.
+# Title, x and y axes.
 STRESS = (
-    ("Stronger wavefronts", "factor on the aberrations, or on 1/r0", MSE, "center right"),
-    ("Other pixel scales (scene 1)", "pixel scale (arcsec)", MSE, "upper left"),
-    ("Flux of noisy stars", "noise level λ", FLUX, "upper left"),
-    ("Flux of stars with a hot pixel (scene 1)", HOT, FLUX, "upper left"),
+    ("Stronger wavefronts", "factor on the aberrations, or on 1/r0", MSE),
+    ("Other pixel scales (scene 1)", "pixel scale (arcsec)", MSE),
+    ("Flux of noisy stars", "noise level λ", FLUX),
+    ("Flux of stars with a hot pixel (scene 1)", HOT, FLUX),
 )
 # By panel of the stress tests: case, label, whether its bound is shown.
 SERIES = (
@@ -100,7 +101,10 @@ def propagation(table):
         for way, part in rows.groupby("way"):
             _, color, marker = WAYS[way]
             dots = {"color": color, "marker": marker, "ls": "", "ms": 5, "alpha": 0.75, "mew": 0}
-            axes.plot(part["time_ms"], part["mse"], **dots)
+            # Bars from the fastest to the slowest repeat.
+            time = part["time_ms"]
+            spread = [time - part["time_ms_low"], part["time_ms_high"] - time]
+            axes.errorbar(time, part["mse"], xerr=spread, elinewidth=0.8, **dots)
         front = rows[rows["pareto"] == "yes"].sort_values("time_ms")
         axes.plot(front["time_ms"], front["mse"], color="black", lw=1.0)
         used = rows[rows["used"] == "yes"]
@@ -117,7 +121,8 @@ def propagation(table):
     threads = "–".join(map(str, sorted({table["threads"].min(), table["threads"].max()})))
     name = table["scene"].iloc[0]
     title = f"{SCENES.get(name, name)}: error of a stamp against its time"
-    figure.suptitle(f"{title}, threads or processes: {threads}".capitalize())
+    repeats = f"median and range of {table['repeats'].max()} repeats"
+    figure.suptitle(f"{title} ({repeats}; threads or processes: {threads})".capitalize())
     return figure
 
 
@@ -139,7 +144,11 @@ def costs(table):
             axes.set(**LOGS)
             axes.grid(True, which="both")
             axes.margins(0.08)
-        row[0].set_ylabel(f"{dataset}: MSE over the least possible")
+        # The least possible error is known well enough at some noise levels only.
+        first = measured.iloc[0]
+        levels = str(first["noise_levels"]).replace(" ", ", ")
+        row[0].set_title(f"{dataset}: {first['stars']} stars, λ = {levels}", loc="left", fontsize=9)
+        row[0].set_ylabel("MSE over the least possible")
     panels[-1, 0].set_xlabel("CPU time of the fit (s)")
     panels[-1, 1].set_xlabel("CPU time of a star (ms)")
     looks = [method_class(name).look for name in table["method"].unique()]
@@ -153,10 +162,13 @@ def costs(table):
 
 def draw_method(fit_axes, star_axes, points, look):
     """Draw a method's settings against the time of the fit, and that in use against a star's."""
-    style = {"color": look.color, "marker": look.marker, "ms": 8, "lw": 1.2}
+    style = {"color": look.color, "marker": look.marker, "ms": 6, "lw": 1.2, "capsize": 2}
     lengths = points[points["point"] != "paper"]
-    fit_axes.plot(lengths["fit_cpu_s"], lengths["over_least"], **style)
-    star_axes.plot(*points.loc[points["used"], ["star_ms", "over_least"]].to_numpy().T, **style)
+    for axes, rows, time in (
+        (fit_axes, lengths, "fit_cpu_s"),
+        (star_axes, points[points["used"]], "star_ms"),
+    ):
+        axes.errorbar(rows[time], rows["over_least"], yerr=rows["over_least_stderr"], **style)
     marked = {"paper": points["point"] == "paper", "knee": points["knee"] == "yes"}
     marked["used"] = points["used"] & (len(points) > 1)
     for name, rows in marked.items():
@@ -194,19 +206,24 @@ def inference(table):
 
 
 def scaling(table):
-    """Time, memory and disk against the stars, and time per star against the stamp's side."""
+    """Time, memory and disk against the stars, and time per star against the stamp's side.
+
+    Memory is drawn where it was measured; time and disk are extrapolated as well.
+    """
     figure = new_figure(6.0, layout="constrained")
     *panels, by_side = figure.subplots(2, 2).flat
     for (stage, against), part in table.groupby(["what", "against"], sort=False):
         style = {"color": COLORS[stage], "marker": "o", "lw": 1.4}
-        label = f"{stage}: exponent {part['exponent'].iloc[0]:.2f}"
+        exponent = f"{part['exponent'].iloc[0]:.2f} ± {part['exponent_stderr'].iloc[0]:.2f}"
+        label = f"{stage}: exponent {exponent}"
         if against == "stamp_px":
             per_star = 1e3 * part["time_s"] / part["stars"]
             by_side.plot(part["stamp_px"], per_star, label=label, **style)
             continue
         measured = part[part["measured"] == "yes"]
         for axes, cost in zip(panels, COSTS, strict=True):
-            axes.plot(part["stars"], part[cost], **style | {"ls": ":", "mfc": "white"})
+            if cost != "peak_mb":
+                axes.plot(part["stars"], part[cost], **style | {"ls": ":", "mfc": "white"})
             name = label if cost == "time_s" else stage
             axes.plot(measured["stars"], measured[cost], label=name, **style)
             axes.set(xlabel="stars", ylabel=COSTS[cost])
@@ -218,42 +235,45 @@ def scaling(table):
     sides = sorted(table["stamp_px"].unique())
     by_side.set_xticks(sides, sides)
     by_side.minorticks_off()
+    # Axes of less than two decades need numbers between powers of ten, and room for two of them.
+    low, high = by_side.get_ylim()
+    by_side.set_ylim(low / 1.3, 1.3 * high)
+    label_log_axis(by_side)
     # Memory hardly changes: a range of two decades shows that rather than its noise.
     low, high = panels[1].get_ylim()
     middle = (low * high) ** 0.5
     panels[1].set_ylim(min(low, middle / 10), max(high, middle * 10))
-    figure.suptitle("Growth of the costs (open: extrapolated)")
+    panels[1].set_xlim(panels[0].get_xlim())
+    figure.suptitle("Growth of the costs, one run each (open: extrapolated; memory is not)")
     return figure
 
 
 def graded(table):
-    """Error under growing stress (NaN where the input was refused) with its bounds."""
-    figure = new_figure(7.4, layout="constrained")
+    """Error under growing stress with its bounds; lines mark the stress that is refused.
+
+    A series has few cases, which no line joins. Refused is the input itself, which has no error.
+    """
+    figure = new_figure(8.0, layout="constrained")
     for number, axes in enumerate(figure.subplots(2, 2).flat):
-        title, xlabel, ylabel, place = STRESS[number]
+        title, xlabel, ylabel = STRESS[number]
         axes.set(**LOGS, title=title, xlabel=xlabel, ylabel=ylabel)
-        refused, series = False, [fields for panel, *fields in SERIES if panel == number]
-        for (case, label, bounded), color in zip(series, SERIES_COLORS, strict=False):
+        series = [fields for panel, *fields in SERIES if panel == number]
+        for index, (case, label, bounded) in enumerate(series):
+            color = SERIES_COLORS[index]
             rows = table[table["case"] == case].sort_values("stress")
-            is_refused = rows["error"].isna()
-            measured, stress = rows[~is_refused], rows.loc[is_refused, "stress"]
-            style = {"lw": 1.3, "color": color, "label": label}
-            axes.plot(measured["stress"], measured["error"], "o-", ms=4, **style)
+            measured, refused = rows.dropna(subset=["error"]), rows[rows["error"].isna()]
+            # Series of the same stress stand side by side.
+            shift = 1.0 + 0.06 * (index - 0.5 * (len(series) - 1))
+            style = {"color": color, "ls": "", "marker": "osv^"[index], "ms": 5}
+            axes.plot(shift * measured["stress"], measured["error"], label=label, **style)
             if bounded:
-                axes.plot(rows["stress"], rows["bound"], "--", lw=1.0, color=color)
-            # Marks of what is refused are near the upper edge, in room made for them.
-            height = np.full(len(stress), 0.96 - 0.04 * SERIES_COLORS.index(color))
-            transform = axes.get_xaxis_transform()
-            axes.plot(stress, height, "x", ms=6, mew=1.6, color=color, transform=transform)
-            refused |= is_refused.any()
-        axes.plot([], [], "--", lw=1.0, color="0.4", label="bound")
-        if refused:
-            axes.plot([], [], "x", ms=6, mew=1.6, color="0.4", label="refused")
-            low, high = np.log10(axes.get_ylim())
-            axes.set_ylim(10**low, 10 ** (high + 0.2 * (high - low)))
+                style = {"color": color, "ls": "", "marker": "_", "ms": 14, "mew": 1.6}
+                axes.plot(shift * measured["stress"], measured["bound"], **style)
+            for stress in refused["stress"]:
+                axes.axvline(stress, color=color, ls=":", lw=1.4, label=f"{label}: refused")
+        axes.plot([], [], color="0.4", ls="", marker="_", ms=14, mew=1.6, label="bound")
         axes.grid(True, which="major")
-        shift = (0.0, 0.13, 1.0, 1.0) if place == "center right" else None
-        axes.legend(fontsize=7, loc=place, bbox_to_anchor=shift)
+        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.suptitle("Error under growing stress, its bound, and what is refused")
     return figure
 

@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.base.files import write_text
 from psfdae.commands.cli import main, stage
 from psfdae_paper.configuration.compose import write_settings
-from psfdae_paper.stages.record import cpu_model
+from psfdae_paper.source import cpu_model
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "numexpr", "poppy", "hcipy")
 """Packages whose versions can change a time; recorded where they are installed."""

@@ -31,17 +31,20 @@ rule paper_tables:
         lambda w: datasets.evaluations(RUN, w.dataset, ["random"]),
     output:
         **{
-            metric: report(
-                f"{RESULTS}/tables/{{dataset}}_{metric}.csv",
-                caption="../report/paper_tables.rst",
-                category=lambda w: datasets.report_category(RUN, w),
-                subcategory="{dataset}",
-                labels={"figure": f"table of {metric}"},
-            )
+            metric: f"{RESULTS}/tables/{{dataset}}_{metric}.csv"
             for metric in datasets.METRICS
         },
-        markdown=expand(
-            f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.md", metric=datasets.METRICS
+        texts=expand(
+            f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.{{ending}}",
+            metric=datasets.METRICS,
+            ending=["md", "tex"],
+        ),
+        page=report(
+            f"{RESULTS}/pages/{{dataset}}.html",
+            caption="../report/paper_tables.rst",
+            category=lambda w: datasets.report_category(RUN, w),
+            subcategory="{dataset}",
+            labels={"figure": "tables beside the paper's"},
         ),
     log:
         f"{RESULTS}/logs/paper_tables/{{dataset}}.log",
@@ -51,11 +54,12 @@ rule paper_tables:
     params:
         source=hash_code("paper-tables"),
         out=datasets.metric_options,
+        note=lambda w: report_page.describe_differences(RUN, w.dataset),
     message:
         "Writing the paper's tables of {wildcards.dataset}"
     shell:
         "psfdae paper paper-tables --dataset {wildcards.dataset} {params.out} {input}"
-        " > {log} 2>&1"
+        " --note {params.note:q} --page {output.page} > {log} 2>&1"
 
 
 rule held_out:
@@ -101,3 +105,36 @@ rule psf_metrics:
         "Collecting the metrics of all datasets"
     shell:
         "psfdae paper collect --out {output} {input} > {log} 2>&1"
+
+
+rule methods_table:
+    input:
+        rules.psf_metrics.output,
+    output:
+        **{
+            metric: f"{RESULTS}/tables/methods_{metric}.md"
+            for metric in datasets.METRICS
+        },
+        latex=expand(
+            f"{RESULTS}/tables/methods_{{metric}}.tex", metric=datasets.METRICS
+        ),
+        page=report(
+            f"{RESULTS}/pages/methods.html",
+            caption="../report/methods_table.rst",
+            category="All methods",
+            labels={"figure": "table of all methods"},
+        ),
+    log:
+        f"{RESULTS}/logs/methods_table/all.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/methods_table/all.tsv"
+    localrule: True
+    params:
+        source=hash_code("methods-table"),
+        out=datasets.metric_options,
+        note=lambda w: "; ".join(report_page.group_warnings(RUN)),
+    message:
+        "Writing the table of all methods"
+    shell:
+        "psfdae paper methods-table {input} {params.out} --note {params.note:q}"
+        " --page {output.page} > {log} 2>&1"

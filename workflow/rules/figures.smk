@@ -88,6 +88,7 @@ rule figure_curves:
         labels=lambda w: [
             f"--label={x}" for x in fits.histories(RUN, w.dataset).values()
         ],
+        training=lambda w: report_page.describe_training(RUN, w.dataset),
         source=hash_code("figure curves"),
     message:
         "Drawing the training curves of {wildcards.dataset}"
@@ -116,8 +117,9 @@ rule figure_errors:
     params:
         source=lambda w: fits.estimators_code(RUN, "figure errors", w.dataset),
         out=datasets.metric_options,
+        note=lambda w: report_page.describe_differences(RUN, w.dataset),
     message:
         "Drawing errors of {wildcards.dataset} against the noise level"
     shell:
         "psfdae paper figure errors --dataset {wildcards.dataset} {params.out} {input}"
-        " > {log} 2>&1"
+        " --note {params.note:q} > {log} 2>&1"

@@ -6,6 +6,7 @@ rule runtime:
             for file in datasets.products(RUN, dataset)
         ],
         rules.psf_metrics.output,
+        rules.methods_table.output,
         rules.held_out.output,
         rules.calibrate.output,
         rules.scene3.input,

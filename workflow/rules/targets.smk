@@ -1,6 +1,7 @@
 rule tables:
     input:
         rules.psf_metrics.output,
+        rules.methods_table.output,
         rules.held_out.output,
         lambda w: [
             file

@@ -190,7 +190,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     """
     # Margins, height of a row and of the numbers below it, in inches.
     longest = max(len(line) for row in rows for line in row.lines)
-    margin_left, margin_right = max(1.0, 0.07 * longest), 0.1
+    margin_left, margin_right = max(1.0, 0.08 * longest), 0.1
     top, bottom, cell, text = 0.85, 0.35, 0.86, 0.17
     # Numbers stand below the rows that have errors.
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)

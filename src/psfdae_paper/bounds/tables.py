@@ -59,8 +59,8 @@ class Tables:
         *("ess_median", "ess_low", "last_change", "undetected"),
     )
     growth_columns = (
-        *("dataset", "reference", "method", "noise_level", "draws", "mse", "ess_mean"),
-        *("ess_median", "last_change", "limit", "exponent", "fit_rms"),
+        *("dataset", "reference", "method", "noise_level", "draws", "mse", "stderr"),
+        *("n", "ess_mean", "ess_median", "last_change", "limit", "exponent", "fit_rms"),
     )
 
     def __init__(self, dataset: str, stars: BoundedStars) -> None:
@@ -154,7 +154,9 @@ class Tables:
         # Errors by number of draws, and the power law a + b M^−c that extrapolates them.
         draws, bank = np.array(list(measures)), Estimates.from_bank(measures)
         for number, reference in enumerate(self.stars.truth):
-            errors = np.array([values[number].mean() for values in measures.values()])
+            # Mean error of each bank with its standard error, clustered by field.
+            means = [cluster_mean(values[number], self.stars.field) for values in measures.values()]
+            errors, stderr = np.array(means).T
             evidence = bank.evidence(number, self.stars.field)
             limit, exponent, residual = extrapolate(draws, errors)
             if not evidence.tight:
@@ -168,6 +170,8 @@ class Tables:
                     "noise_level": level,
                     "draws": count,
                     "mse": error,
+                    "stderr": deviation,
+                    "n": self.stars.field.size,
                     "ess_mean": values[-1].mean(),
                     "ess_median": np.median(values[-1]),
                     "last_change": evidence.last_change,
@@ -175,7 +179,9 @@ class Tables:
                     "exponent": exponent,
                     "fit_rms": residual,
                 }
-                for count, error, values in zip(draws, errors, measures.values(), strict=True)
+                for count, error, deviation, values in zip(
+                    draws, errors, stderr, measures.values(), strict=True
+                )
             ]
 
 

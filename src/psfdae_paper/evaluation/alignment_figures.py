@@ -19,7 +19,7 @@ from psfdae_paper.evaluation import drawing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, FigureBase
     from matplotlib.image import AxesImage
 
 
@@ -42,6 +42,7 @@ def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str
     # A part of the figure for each group, with a common grey scale.
     fields = rows[0][1].shape[1]
     figure = new_figure(0.9 * len(rows) * len(titles) + 0.5 * len(titles), layout="constrained")
+    images: list[AxesImage] = []
     parts = figure.subfigures(len(titles), 1, squeeze=False)[:, 0]
     for group, (part, title) in enumerate(zip(parts, titles, strict=True)):
         # Rows are treatments, columns are fields.
@@ -50,8 +51,9 @@ def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str
         peak = rows[0][1][group].max()
         for row_panels, (label, stamps) in zip(panels, rows, strict=True):
             for axes, stamp in zip(row_panels, stamps[group], strict=True):
-                _draw_stamp(axes, stamp, peak)
+                images.append(_draw_stamp(axes, stamp, peak))
             row_panels[0].set_ylabel(label, rotation=0, ha="right", va="center")
+        _add_flux_bar(part, images[-1], panels, "flux / maximum of the noise-free stamps")
         # The first field is the centre, the others are on a circle around it.
         for field, axes in enumerate(panels[0]):
             axes.set_title("centre" if field == 0 else f"{360 * (field - 1) // (fields - 1)}°")
@@ -59,13 +61,23 @@ def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str
     return figure
 
 
-def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> None:
+def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> AxesImage:
     """Draw a stamp in grey; the square root of the flux makes wings visible."""
     # Rows run along +y: the first one is at the bottom.
     grey = np.clip(stamp / peak, 0.0, 1.0) ** 0.5
-    axes.imshow(grey, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     axes.set_xticks([])
     axes.set_yticks([])
+    return axes.imshow(
+        grey, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest"
+    )
+
+
+def _add_flux_bar(figure: FigureBase, image: AxesImage, panels: np.ndarray, label: str) -> None:
+    """Add the colour bar of stamps, whose grey is the square root of the flux."""
+    bar = figure.colorbar(image, ax=panels, shrink=0.8, aspect=15, pad=0.01, label=label)
+    # Ticks at fractions of the maximum, whose square roots are drawn.
+    shares = np.array([0.0, 0.05, 0.2, 0.5, 1.0])
+    bar.set_ticks(np.sqrt(shares), labels=[f"{share:g}" for share in shares])
 
 
 @apply_style
@@ -87,7 +99,8 @@ def draw_predictions(
     for row_panels, (method, by_level) in zip(panels, estimates.items(), strict=True):
         # The highest noise level first, so that the points of lower noise are above its points.
         levels = zip(sorted(by_level, reverse=True), ("#e69f00", "#0072b2"), strict=False)
-        styles = [(level, {"color": color, "label": f"λ = {level:g}"}) for level, color in levels]
+        prefix = f"{len(truth)} states, λ = "
+        styles = [(level, {"color": c, "label": f"{prefix}{level:g}"}) for level, c in levels]
         for index, axes in enumerate(row_panels):
             for level, style in styles:
                 axes.plot(truth[:, index], by_level[level][:, index], ".", ms=2.2, **style)
@@ -173,61 +186,117 @@ def bin_errors(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @apply_style
 def draw_twins(
-    curves: pd.DataFrame, stamps: Sequence[tuple[str, np.ndarray]], state: np.ndarray
+    curves: pd.DataFrame, pairs: Sequence[tuple[str, np.ndarray, np.ndarray]], state: np.ndarray
 ) -> Figure:
-    """Draw the misfit of multiples of a state, and the stamps of the state and its twin.
+    """Draw the distance of a state from its multiples, and the difference from its twin.
 
-    The twin is the opposite misalignment, whose stamps in focus are nearly the same.
+    The twin is the opposite misalignment. Distances are √χ², the number of standard deviations by
+    which all pixels together differ.
 
     Parameters
     ----------
     curves : DataFrame
-        Columns noise_level, defocus_mm, position (1 the state, −1 its twin), chi2.
-    stamps : sequence of (label, stamps of shape (F, d, d))
+        Columns noise_level, defocus_mm, position (1 the state, −1 its twin), chi2. A defocus with
+        the twin alone is drawn in the last panel only.
+    pairs : sequence of (label, stamps, differences), both of shape (F, d, d)
+        Stamps of the state, and stamps of the twin less these in standard deviations of the noise.
         Only the middle of each stamp is drawn.
     state : ndarray, shape (4,)
         In units of the range.
     """
-    # χ² along the line through the state and its twin, one panel per noise level.
-    figure = new_figure(7.2, layout="constrained")
-    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.15])[:, 0]
-    panels = top.subplots(1, curves.noise_level.nunique(), sharey=True, squeeze=False)[0]
-    for axes, (level, rows) in zip(panels, curves.groupby("noise_level"), strict=True):
-        for color, (defocus, line) in zip(SERIES_COLORS, rows.groupby("defocus_mm"), strict=False):
-            # In focus the stamps of a state and its twin nearly agree, beyond focus they differ.
-            label = "in focus" if defocus == 0 else f"CCD {defocus:g} mm beyond focus"
-            axes.plot(line.position, np.maximum(line.chi2, 1e-2), color=color, label=label)
-        # χ² = 9 is a difference of three standard deviations.
-        axes.axhline(9.0, color="black", ls=":", lw=1.0, label="3 σ")
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=0.3)
-        axes.set_title(f"λ = {level:g}")
-        axes.set_xlabel("multiple of the state; −1 is its twin")
-        axes.grid(True)
-    panels[0].set_ylabel("χ² from the state's stamps")
-    panels[0].legend(loc="lower left")
-    named_values = zip(map(parameter_label, DEGREES_OF_FREEDOM), state, strict=True)
-    text = ", ".join(f"{name} {value:+.2f}" for name, value in named_values)
-    top.suptitle(f"State: {text} (range)", fontsize=10)
-    # Stamps on a common grey scale, without a quarter of their side at each edge.
-    stamp_panels = bottom.subplots(len(stamps), stamps[0][1].shape[0])
-    peak = max(images.max() for _, images in stamps)
-    for row_panels, (label, images) in zip(stamp_panels, stamps, strict=True):
-        for axes, stamp in zip(row_panels, images, strict=True):
-            edge = stamp.shape[0] // 4
-            _draw_stamp(axes, stamp[edge:-edge, edge:-edge], peak)
-        row_panels[0].set_ylabel(label, rotation=0, ha="right", va="center")
+    figure = new_figure(7.6, layout="constrained")
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.3])[:, 0]
+    _draw_twin_distances(top, curves, state)
+    _draw_twin_stamps(bottom, pairs, float(curves.noise_level.min()))
     return figure
 
 
+def _draw_twin_distances(figure: FigureBase, curves: pd.DataFrame, state: np.ndarray) -> None:
+    """Draw √χ² of multiples of a state, a panel per noise level, and of its twin by defocus."""
+    levels = np.unique(curves.noise_level)
+    panels = figure.subplots(1, levels.size + 1, sharey=True, squeeze=False)[0]
+    curves = curves.assign(sigmas=np.sqrt(curves.chi2))
+    twins = curves[np.isclose(curves.position, -1.0)]
+    for axes, level in zip(panels, levels, strict=False):
+        rows = curves[curves.noise_level == level].groupby("defocus_mm")
+        lines = [(float(defocus), line) for defocus, line in rows if len(line) > 1]
+        for color, (defocus, line) in zip(SERIES_COLORS, lines, strict=False):
+            label = "in focus" if defocus == 0 else f"{defocus:g} mm beyond focus"
+            axes.plot(line.position, np.maximum(line.sigmas, 1e-2), color=color, label=label)
+            # The twin, with its distance as a number.
+            twin = line[np.isclose(line.position, -1.0)]
+            axes.plot(twin.position, twin.sigmas, color=color, marker="o", ms=5)
+            for x, y in zip(twin.position, twin.sigmas, strict=True):
+                offset = {"xytext": (3, -11), "textcoords": "offset points", "fontsize": 8}
+                axes.annotate(f"{y:.3g} σ", (x, y), color=color, **offset)
+        axes.set_title(f"λ = {level:g}")
+        axes.set_xlabel("multiple of the state; −1 is its twin")
+        axes.legend(loc="lower left", fontsize=7)
+    # Distance of the twin against the defocus, for the choice of the detector's position.
+    for marker, level in zip("osv^D", levels, strict=False):
+        line = twins[twins.noise_level == level]
+        style = {"color": "black", "marker": marker, "ms": 4, "lw": 1.0}
+        panels[-1].plot(line.defocus_mm, line.sigmas, label=f"λ = {level:g}", **style)
+    panels[-1].set_title("twin against defocus")
+    panels[-1].set_xlabel("CCD beyond focus (mm)")
+    panels[-1].legend(loc="lower right", fontsize=7)
+    for axes in panels:
+        # Three standard deviations can be told from noise.
+        axes.axhline(3.0, color="black", ls=":", lw=1.0)
+        axes.grid(True)
+    panels[0].set_yscale("log")
+    panels[0].set_ylim(bottom=1.0)
+    drawing.label_log_axis(panels[0])
+    panels[0].set_ylabel("√χ² from the state's stamps (σ); dotted: 3 σ", fontsize=8)
+    named_values = zip(map(parameter_label, DEGREES_OF_FREEDOM), state, strict=True)
+    text = ", ".join(f"{name} {value:+.2f}" for name, value in named_values)
+    figure.suptitle(f"State: {text} (range)", fontsize=10)
+
+
+def _draw_twin_stamps(
+    figure: FigureBase, pairs: Sequence[tuple[str, np.ndarray, np.ndarray]], level: float
+) -> None:
+    """Draw rows of stamps, each followed by a row of differences in units of the noise at λ."""
+    # Stamps on a common grey scale and differences on a common colour scale, without a quarter of
+    # their side at each edge.
+    stamp_panels = figure.subplots(2 * len(pairs), pairs[0][1].shape[0])
+    peak = max(images.max() for _, images, _ in pairs)
+    limit = max(np.abs(differences).max() for _, _, differences in pairs)
+    for number, (label, images, differences) in enumerate(pairs):
+        upper, lower = stamp_panels[2 * number : 2 * number + 2]
+        edge = images.shape[1] // 4
+        middle = np.s_[edge:-edge, edge:-edge]
+        for axes, stamp in zip(upper, images, strict=True):
+            grey = _draw_stamp(axes, stamp[middle], peak)
+        for axes, difference in zip(lower, differences, strict=True):
+            scale = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+            color = axes.imshow(difference[middle], origin="lower", **scale)
+            axes.set_xticks([])
+            axes.set_yticks([])
+        upper[0].set_ylabel(f"state\n{label}", rotation=0, ha="right", va="center")
+        lower[0].set_ylabel("twin −\nstate", rotation=0, ha="right", va="center")
+    for field, axes in enumerate(stamp_panels[0]):
+        circle = len(stamp_panels[0]) - 1
+        axes.set_title("centre" if field == 0 else f"{360 * (field - 1) // circle}°", fontsize=8)
+    # Each colour bar is beside half of the rows, but belongs to every second one.
+    upper_half, lower_half = np.split(stamp_panels, 2)
+    _add_flux_bar(figure, grey, upper_half, "states: flux / maximum")
+    label = f"twin − state (σ at λ = {level:g})"
+    figure.colorbar(color, ax=lower_half, shrink=0.8, aspect=15, pad=0.01, label=label)
+
+
 @apply_style
-def draw_correlations(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> Figure:
+def draw_correlations(
+    panels: Sequence[Sequence[tuple[str, np.ndarray]]], half_width: float
+) -> Figure:
     """Draw matrices of correlations; cells that are NaN stay empty.
 
     Parameters
     ----------
     panels : sequence of rows of (title, matrix of shape (4, 4))
         The longest row fills the width of the figure.
+    half_width : float
+        Largest half of a 95 % interval of the measured correlations.
     """
     short_labels = ("dx", "dy", "tx", "ty")
     # Rows of panels; those that a row does not fill stay empty.
@@ -249,4 +318,5 @@ def draw_correlations(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> Fig
                     axes.text(b, a, f"{value:.2f}", ha="center", va="center", size=6.5, color=color)
     # One colour bar: all matrices have the range −1 … 1.
     figure.colorbar(images[-1], ax=all_axes, shrink=0.5, label="correlation of signed errors")
+    figure.suptitle(f"Measured correlations have 95 % intervals of at most ± {half_width:.2f}")
     return figure

@@ -61,7 +61,8 @@ def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) ->
         # The rows of each method are repeated for the floor, together with posterior means.
         methods = table[(table.reference == reference) & (table.bound != "floor")]
         for method_class, errors in drawing.group_by_method(methods.sort_values("noise_level")):
-            axes.plot(errors["noise_level"], errors["mse"], **drawing.method_line(method_class))
+            style = {**drawing.method_line(method_class), "capsize": 3}
+            axes.errorbar(errors["noise_level"], errors["mse"], yerr=errors["stderr"], **style)
         for name, look in MEANS.items():
             _draw_posterior_mean(axes, rows[rows.method == name].sort_values("noise_level"), look)
         _set_whole_axis(axes, rows)
@@ -104,7 +105,10 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
             for bound, values in errors.groupby("bound"):
                 style = drawing.method_line(method_class)
                 style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
-                axes.plot(values["noise_level"], values["efficiency"], **style)
+                # The standard error of the difference to a given bound, in units of the MSE.
+                error = values["efficiency"] * values["stderr"] / values["mse"]
+                style["capsize"] = 3
+                axes.errorbar(values["noise_level"], values["efficiency"], yerr=error, **style)
         axes.axhline(1.0, color="black", lw=1.0)
         # An efficiency needs a tight bound.
         if method_rows["efficiency"].isna().all():
@@ -123,7 +127,7 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
         )
     if is_floor.any():
         handles.append(drawing.make_entry("against the local floor", ls=":", lw=1.6))
-    title = f"{dataset}: efficiency against the noise level, 1 = no better is possible"
+    title = f"{dataset}: efficiency, 1 = no better is possible, n = {table['n'].max()} test stars"
     drawing.finish_panels(figure, panels, title, handles, 3, "efficiency: bound / MSE")
     return figure
 
@@ -144,7 +148,8 @@ def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
         for (level, name), sizes in rows.sort_values("draws").groupby(["noise_level", "method"]):
             # Both posterior means of a level have its colour, and a marker of their own.
             color, marker = colors[level], MEANS[str(name)]["marker"]
-            axes.plot(sizes["draws"], sizes["mse"], color=color, marker=marker, ms=4.5, lw=1.4)
+            style = {"color": color, "marker": marker, "ms": 4.5, "lw": 1.4, "capsize": 3}
+            axes.errorbar(sizes["draws"], sizes["mse"], yerr=sizes["stderr"], **style)
             axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
         # A tick at each size of the bank.
         draws = np.unique(rows["draws"])
@@ -159,7 +164,8 @@ def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
         drawing.make_entry(**look | {"color": "black"}, ls="", ms=4.5) for look in MEANS.values()
     ]
     handles.append(drawing.make_entry("limit of the fit", ls="--", lw=1.0))
-    title = f"{dataset}: the posterior mean over banks of growing size"
+    count = dataset_rows["n"].max()
+    title = f"{dataset}: the posterior mean over banks of growing size, n = {count} test stars"
     drawing.finish_panels(figure, panels, title, handles, 4)
     return figure
 
@@ -246,7 +252,9 @@ def draw_headline(
     for number, row in enumerate(rows, 1):
         row_bottom = top * figure.get_figheight() - number * cell[1]
         draw_row(stamps, row, (left_edge * WIDTH_IN, row_bottom), cell, peak)
-    # Each title is above the middle of its part.
+    # The scale of the colours is below the stamps, each title above the middle of its part.
+    scale = "Colour: √flux from 0 to the maximum of the truth; noisy stars to their own"
+    figure.text(left_edge + 0.5 * columns * cell_width, 0.05, scale, ha="center", fontsize=7)
     figure.text(left_edge + 0.5 * columns * cell_width, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _draw_errors(panel, methods, efficiency, bounds)
@@ -264,8 +272,8 @@ def _draw_errors(
         # Every bound that the method is compared with has a row with the same error.
         rows = efficiency[efficiency.method == method_class.name].drop_duplicates("noise_level")
         rows = rows.sort_values("noise_level")
-        style = {**drawing.method_line(method_class), "lw": 1.6, "ms": marker_size}
-        axes.plot(rows["noise_level"], rows["mse"], **style)
+        style = {**drawing.method_line(method_class), "lw": 1.6, "ms": marker_size, "capsize": 2}
+        axes.errorbar(rows["noise_level"], rows["mse"], yerr=rows["stderr"], **style)
         return rows
 
     for method_class in methods:
@@ -288,7 +296,8 @@ def _draw_errors(
     bayes = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = bayes[bayes.tight == "yes"]
     color = MEANS["bayes"]["color"]
-    axes.plot(bayes["noise_level"], bayes["value"], color=color, ls="--", lw=1.2)
+    error_bars: Style = {"color": color, "ls": "--", "lw": 1.2, "capsize": 2}
+    axes.errorbar(bayes["noise_level"], bayes["value"], yerr=bayes["stderr"], **error_bars)
     axes.plot(tight["noise_level"], tight["value"], color=color, marker="o", ls="", ms=5)
     _write_name(axes, bayes["noise_level"], bayes["value"], "least possible", color, below=True)
     floor = bounds[bounds.method == "floor"].sort_values("noise_level")

@@ -6,6 +6,7 @@ Functions take histories of trainings, or the table of the stage `evaluate`, and
 from __future__ import annotations
 
 from collections.abc import Mapping
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,26 +21,39 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+WHOLE_STAMPS: Style = {"lw": 1.2, "ls": "--", "marker": "s", "ms": 2.5}
+"""Line of training errors that the validation can be compared with; it may be a single epoch."""
+
+
 @apply_style
 def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     """Draw training and validation error of each network of a dataset.
+
+    Both are mean squared errors without the weights of the loss, so that they can be compared.
 
     Parameters
     ----------
     histories : mapping
         Table of each network by its label in the legend, with the columns step, train_mse and
         validation_mse (NaN where it was not measured); errors are per pixel of stamps with sum 1.
+        The column side_px is the side of the middle of the stamps that the epoch trains on; without
+        it, all epochs train on whole stamps.
     title : str
         Title of the figure.
     """
     # One panel; errors of all networks of the dataset are on the same scale.
-    figure = new_figure(4.6, layout="constrained")
+    figure = new_figure(4.9, layout="constrained")
     axes = figure.add_subplot()
     entries = []
-    # Dotted training error, solid validation error with markers, in one colour per network.
+    # Training errors without markers, validation errors with them, in one colour per network.
     for i, (label, history) in enumerate(histories.items()):
         color = SERIES_COLORS[i % len(SERIES_COLORS)]
-        axes.plot(history["step"], history["train_mse"], color=color, lw=1.0, ls=":")
+        # The middle of a stamp has larger errors than a whole stamp: only epochs on whole stamps,
+        # which are the last ones, are joined by a line that is compared with the validation.
+        side_px = history.get("side_px", pd.Series(0, history.index))
+        whole = history[side_px == side_px.max()]
+        axes.plot(history["step"], history["train_mse"], color=color, lw=0.8, ls=":", alpha=0.6)
+        axes.plot(whole["step"], whole["train_mse"], color=color, **WHOLE_STAMPS)
         # The validation error is measured at few steps.
         validation_rows = history.dropna(subset=["validation_mse"])
         step, mse = validation_rows["step"], validation_rows["validation_mse"]
@@ -51,23 +65,26 @@ def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> F
         entries.append(drawing.make_entry(label, color=color, lw=1.6))
     # Below the networks the legend explains lines and markers.
     entries += [
-        drawing.make_entry("training stars", lw=1.0, ls=":"),
-        drawing.make_entry("validation stars", lw=1.6, marker="o", ms=3.5),
+        drawing.make_entry("training stars, middle of the stamps", lw=0.8, ls=":"),
+        drawing.make_entry("training stars, whole stamps", **WHOLE_STAMPS),
+        drawing.make_entry("validation stars, whole stamps", lw=1.6, marker="o", ms=3.5),
         drawing.make_entry("kept network", marker="*", ms=11, ls=""),
     ]
     # Errors decrease by decades during the training.
     axes.set_yscale("log")
     drawing.label_log_axis(axes)
     axes.set_xlabel("optimiser step")
-    axes.set_ylabel(drawing.METRIC_LABELS["mse"])
+    axes.set_ylabel(f"{drawing.METRIC_LABELS['mse']}, mean over the noise levels", fontsize=8)
     axes.set_title(title)
     axes.grid(True, which="major")
-    axes.legend(handles=entries, ncols=2)
+    figure.legend(handles=entries, ncols=2, loc="outside lower center")
     return figure
 
 
 @apply_style
-def draw_errors(metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric: str) -> Figure:
+def draw_errors(
+    metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric: str, note: str = ""
+) -> Figure:
     """Draw a metric of every method against the noise level.
 
     There is one panel per reference, realisation or template.
@@ -82,12 +99,19 @@ def draw_errors(metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric
     dataset : str
         Dataset whose rows are drawn.
     metric : str
-        "mse", on a logarithmic axis, or "ssim", on a linear one.
+        "mse", or "ssim", which is drawn as the dissimilarity 1 − SSIM; both on logarithmic axes.
+    note : str
+        Below the title: how the run differs from the paper's.
     """
     # Measured and published values; the paper's rows get our names of its methods.
     measured_rows = metrics[(metrics.dataset == dataset) & (metrics.metric == metric)]
     paper_points = paper[(paper.dataset == dataset) & (paper.metric == metric)]
     paper_points = paper_points.assign(method=paper_points["method"].map(read_paper_names()))
+    # Values of SSIM crowd below 1: their differences from it span decades.
+    if metric == "ssim":
+        measured_rows, paper_points = (
+            rows.assign(value=1.0 - rows["value"]) for rows in (measured_rows, paper_points)
+        )
     # Test stars at all field positions, and at positions without training stars.
     split_lines = {"random": "-", "held_out": "--"}
     figure, panels = drawing.make_panels(measured_rows)
@@ -115,11 +139,13 @@ def draw_errors(metrics: pd.DataFrame, paper: pd.DataFrame, dataset: str, metric
             drawing.make_entry(split_labels[split_name], ls=line, lw=1.4)
             for split_name, line in split_lines.items()
         ]
-    title = f"{metric.upper()} of {dataset} against the noise level"
+    # Number of test stars of each split.
+    counts = measured_rows.groupby("split", sort=False)["n"].max()
+    stars = ", ".join(f"{count} {split_name}" for split_name, count in counts.items())
+    name = {"mse": "MSE", "ssim": "1 − SSIM"}[metric]
+    title = f"{name} of {dataset} at {levels.size} noise levels, test stars: {stars}"
+    if note:
+        title = f"{title}\n{fill(note, 100)}"
     label = drawing.METRIC_LABELS[metric]
-    # An MSE spans decades over the noise levels; an SSIM does not, and has a linear axis.
-    is_mse = metric == "mse"
-    drawing.finish_panels(
-        figure, panels, title, handles, columns=4, label=label, logarithmic=is_mse
-    )
+    drawing.finish_panels(figure, panels, title, handles, columns=4, label=label)
     return figure

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 METRIC_LABELS = {
     "mse": "MSE per pixel (stamp sum = 1)",
-    "ssim": "SSIM, data range fitted to the paper",
+    "ssim": "1 − SSIM, data range fitted to the paper",
 }
 """Labels of axes by metric."""
 
@@ -78,14 +78,12 @@ def finish_panels(
     handles: Sequence[Artist],
     columns: int,
     label: str = METRIC_LABELS["mse"],
-    logarithmic: bool = True,
 ) -> None:
     """Label the common axis of errors; add the title, and the legend below the panels."""
     # The panels share one axis of errors: the first one's scale and label hold for all.
     first = panels[0][0]
-    if logarithmic:
-        first.set_yscale("log")
-        label_log_axis(first)
+    first.set_yscale("log")
+    label_log_axis(first)
     first.set_ylabel(label)
     figure.suptitle(title)
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)

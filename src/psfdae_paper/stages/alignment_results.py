@@ -412,13 +412,14 @@ def figure_errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) ->
     reads=("telescope", "prescription", "alignment", "optics", "noise"),
 )
 def figure_twin(config: Config, table: File, out: Png) -> None:
-    """Draw a state and its twin, in focus and with the CCD's defocus.
+    """Draw how far a state and its twin differ in their stamps, at several positions of the CCD.
 
-    The curve is the χ² difference between the stamps of a state and of its multiples: at −1, its
-    twin, it is small in focus.
+    The distance is √χ² between the stamps of a state and of its multiples; the multiple −1 is its
+    twin. It is drawn for all multiples in focus and at the CCD's defocus; for the twin at further
+    positions of the CCD, up to twice this defocus.
 
-    The table has a row for each noise level, defocus and multiple. The stamps of both states are
-    shown above the curves.
+    The table has a row for each noise level, defocus and multiple. The stamps of the state, and
+    their differences from the twin's, are shown below the curves.
 
     Parameters
     ----------
@@ -432,27 +433,34 @@ def figure_twin(config: Config, table: File, out: Png) -> None:
     # Multiples of a state form a line through the state, the aligned telescope and the twin. The
     # decentre of the state cancels the field-constant coma of its tilt.
     limit_threads(1)
-    # In focus, the stamps of a state and of its twin hardly differ; with a defocus they do.
-    multiples = np.linspace(-1.5, 1.5, 61)
-    rows, stamp_groups, state = [], [], np.empty(0)
-    for defocus in sorted({0.0, config.alignment.defocus_m}):
-        state, line_stamps = _trace_multiples(config, defocus, multiples)
+    multiples, own_defocus = np.linspace(-1.5, 1.5, 61), config.alignment.defocus_m
+    rows, pairs, state = [], [], np.empty(0)
+    # Positions of the CCD from the focus to twice its own, which is the middle one.
+    for defocus in np.unique(own_defocus * np.linspace(0.0, 2.0, 9)):
+        has_curve = defocus in (0.0, own_defocus)
+        factors = multiples if has_curve else np.array([-1.0, 1.0])
+        state, line_stamps = _trace_multiples(config, defocus, factors)
         # The multiple 1 is the state, −1 its twin.
-        state_stamps = line_stamps[np.argmin(np.abs(multiples - 1.0))].astype(np.float64)
-        twin_stamps = line_stamps[np.argmin(np.abs(multiples + 1.0))]
-        focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
-        stamp_groups += [(f"state\n{focus}", state_stamps), (f"twin\n{focus}", twin_stamps)]
+        state_stamps = line_stamps[np.argmin(np.abs(factors - 1.0))].astype(np.float64)
+        difference = line_stamps - state_stamps
+        if has_curve:
+            focus = "in focus" if defocus == 0 else f"{1e3 * defocus:g} mm"
+            variance = noise_model(config).variance(state_stamps, config.noise.levels[0])
+            twin_difference = difference[np.argmin(np.abs(factors + 1.0))] / np.sqrt(variance)
+            pairs.append((focus, state_stamps, twin_difference))
+        else:
+            factors, difference = factors[:1], difference[:1]
         # χ² = Σ (difference)² / variance over all pixels of all stamps, for each multiple.
         for level in config.noise.levels:
             variance = noise_model(config).variance(state_stamps, level)
-            chi2 = ((line_stamps - state_stamps) ** 2 / variance).sum(axis=(1, 2, 3))
+            chi2 = (difference**2 / variance).sum(axis=(1, 2, 3))
             rows += [
                 (level, 1e3 * defocus, multiple, value)
-                for multiple, value in zip(multiples, chi2, strict=True)
+                for multiple, value in zip(factors, chi2, strict=True)
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
     write_csv(table, curves, digits=6)
-    write_png(alignment_figures.draw_twins(curves, stamp_groups, state), out)
+    write_png(alignment_figures.draw_twins(curves, pairs, state), out)
 
 
 def _trace_multiples(
@@ -524,4 +532,9 @@ def figure_correlation(correlation: ErrorTable, out: Png) -> None:
         upper = [panel(method, paper_rows, "paper, ") for method in in_paper]
         upper += [panel(method, rows) for method in in_paper]
         panels += [upper, [panel(method, rows) for method in not_in_paper]]
-    write_png(alignment_figures.draw_correlations(panels), out)
+    # Intervals of all drawn correlations but those of a number with itself; the Fisher matrix
+    # predicts without scatter.
+    is_measured = table.method.isin([x.name for x in methods if x.name != "cramer_rao"])
+    measured = table[is_measured & (table.parameter_a != table.parameter_b)]
+    half_width = float((0.5 * (measured.ci_high - measured.ci_low)).max())
+    write_png(alignment_figures.draw_correlations(panels, half_width), out)

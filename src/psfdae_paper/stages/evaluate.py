@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import spread_stars
-from psfdae.base.files import Column, Product, write_csv, write_parquet, write_product, write_text
+from psfdae.base.files import Column, Product, write_csv, write_parquet, write_product
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
 from psfdae.base.reading import read_table
@@ -29,7 +29,7 @@ from psfdae.training.star_sets import noisy_test_images, read_stars, split_stars
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation import comparison, readable
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import format_paper_table, paper_table
 from psfdae_paper.stars.fields import square_grid
@@ -193,6 +193,7 @@ def estimators(
 
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
+Note = Annotated[str, "How the run differs from the paper's; empty if it does not."]
 Metric = Literal["mse", "ssim"]
 
 
@@ -243,13 +244,18 @@ def held_out(per_star: Annotated[tuple[File, ...], {"argument": True}], out: Fil
 
 @command("paper paper-tables")
 def paper_tables(
-    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
+    dataset: str,
+    evaluations: Evaluations,
+    out: tuple[tuple[Metric, File], ...],
+    page: File,
+    note: Note = "",
 ) -> None:
     """Write the paper's tables, with published and measured errors.
 
     Rows are methods, columns noise levels; measured errors are given for each reference.
 
-    The table is written as CSV, and in the same folder as Markdown for the pages.
+    Each table is written as CSV, and in the same folder as Markdown and LaTeX; all of them together
+    are a page for readers.
 
     Parameters
     ----------
@@ -259,10 +265,53 @@ def paper_tables(
         CSV files of the stage evaluate.
     out : sequence of pairs
         Metric and its CSV; repeat for more.
+    page : Path
+        HTML page with all tables.
+    note : str
+        How the run differs from the paper's.
     """
-    # Each table as CSV and as Markdown.
     measured_rows = read_tables(evaluations, MeasuredStars.columns)
+    tables = []
     for metric, path in out:
+        # Numbers for programs, texts for readers.
         table = paper_table(measured_rows, dataset, metric)
         write_csv(path, table, 6)
-        write_text(path.with_suffix(".md"), format_paper_table(table, dataset, metric))
+        text_table = format_paper_table(table, metric)
+        title = f"{metric.upper()} of {dataset}, split random"
+        readable.write_readable(path, text_table, title, note)
+        tables.append((title, text_table))
+    readable.write_page(page, tables, note)
+
+
+@command("paper methods-table")
+def methods_table(
+    metrics: Annotated[File, {"argument": True}],
+    out: tuple[tuple[Metric, File], ...],
+    page: File,
+    note: Note = "",
+) -> None:
+    """Write the errors of all methods side by side, with the paper's.
+
+    METRICS is the CSV of the stage collect. A row is a dataset, split, reference and noise level, a
+    column a method; MSE are in millionths, with standard errors of the stars and of the seeds, as
+    far as the latter were measured.
+
+    Parameters
+    ----------
+    metrics : Path
+        CSV of the stage collect.
+    out : sequence of pairs
+        Metric and its Markdown file, beside which the LaTeX is written; repeat for more.
+    page : Path
+        HTML page with all tables.
+    note : str
+        How the run differs from the paper's.
+    """
+    rows, tables = read_table(metrics, *MeasuredStars.columns[:-1], "seed_stderr"), []
+    units = {"mse": "MSE × 10⁶", "ssim": "SSIM"}
+    for metric, path in out:
+        table = readable.tabulate_methods(rows, metric)
+        title = f"{units[metric]} of all methods, ± standard error"
+        readable.write_readable(path, table, title, note)
+        tables.append((title, table))
+    readable.write_page(page, tables, note)

@@ -26,7 +26,7 @@ from psfdae_paper.evaluation.drawing import reference_title
 from psfdae_paper.evaluation.figures import draw_energy, draw_templates, to_field_unit
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import read_published
-from psfdae_paper.stages.evaluate import Evaluations, Metric
+from psfdae_paper.stages.evaluate import Evaluations, Metric, Note
 from psfdae_paper.stars.framing import cut_margin
 
 RestoredStars = Annotated[File, "Product of the stage evaluate: images of some stars."]
@@ -141,7 +141,8 @@ def figure_headline(
     # Errors of methods and bounds of the same dataset.
     errors, limits = (read_rows(path, dataset, "realisation") for path in (efficiency, bounds))
     limits = limits[limits.metric == "mse"]
-    titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
+    count = limits["n"].max()
+    titles = (f"Test stars of {dataset}, λ = {level:g}", f"Error against noise, {count} test stars")
     write_png(bound_figures.draw_headline(rows, [*restored_by_method], errors, limits, titles), out)
 
 
@@ -217,7 +218,10 @@ def figure_curves(
 
 @command("paper figure errors")
 def figure_errors(
-    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...]
+    dataset: str,
+    evaluations: Evaluations,
+    out: tuple[tuple[Metric, File], ...],
+    note: Note = "",
 ) -> None:
     """Draw metrics against the noise level, with the paper's points.
 
@@ -231,6 +235,8 @@ def figure_errors(
         CSV files of the stage evaluate.
     out : sequence of pairs
         Metric and its PNG; repeat for more.
+    note : str
+        Line below the title: how the run differs from the paper's.
     """
     metrics = read_tables(evaluations, MeasuredStars.columns)
     for metric, path in out:
@@ -238,7 +244,7 @@ def figure_errors(
         if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
-        write_png(curves.draw_errors(metrics, read_published("psf"), dataset, metric), path)
+        write_png(curves.draw_errors(metrics, read_published("psf"), dataset, metric, note), path)
 
 
 @command("paper figure bounds")

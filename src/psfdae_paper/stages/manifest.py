@@ -8,6 +8,9 @@ from psfdae.base.files import compute_sha256, write_text
 from psfdae.base.options import Folder
 from psfdae_paper.configuration.command import command
 
+CHECKSUMS = "SHA256SUMS"
+"""File with the checksums of a run."""
+
 
 @command("paper manifest")
 def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
@@ -34,4 +37,4 @@ def manifest(results: Annotated[Folder, {"argument": True}]) -> None:
         is_product = not is_hidden and name.parts[0] not in no_products
         if path.is_file() and is_product and other_runs.isdisjoint(path.parents):
             lines.append(f"{compute_sha256(path)}  {name.as_posix()}\n")
-    write_text(results / "SHA256SUMS", "".join(lines))
+    write_text(results / CHECKSUMS, "".join(lines))

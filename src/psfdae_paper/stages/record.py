@@ -28,7 +28,7 @@ from psfdae.base.files import ProductError, write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae_paper.configuration.command import command
-from psfdae_paper.source import git
+from psfdae_paper.source import cpu_model, git
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -285,17 +285,6 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
-
-
-def cpu_model() -> str:
-    """Return the model of the processor as the operating system names it."""
-    # A file of Linux; elsewhere Python asks the system.
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def measure_matrix_speed(size: int = 1024, repeats: int = 5) -> float:

@@ -1,20 +1,140 @@
-"""Answers for the first page of the report (workflow/report/workflow.rst)."""
+"""Identity of a run, its differences from the paper, and answers for the report's first page.
+
+The first page is workflow/report/workflow.rst.
+"""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from inspect import getdoc
 from pathlib import Path
 from typing import Protocol
 
+from psfdae.base.reading import read_table, read_yaml
+from psfdae.base.settings import leaves
 from psfdae.methods import method
+from psfdae_paper.configuration.compose import drop_neutral_settings
 from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.workflow.fits import method_names
-from psfdae_paper.workflow.run import Run, list_default_datasets
+from psfdae_paper.workflow.run import SCENE3, Run, list_default_datasets, load_dataset_config
 
 HEADLINE_DATASET = "dataset3"
 """The dataset of the headline figure."""
+
+DATA = {
+    *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+    *("noise", "parts", "prescription", "alignment"),
+}
+"""Groups of the configuration that decide the stars of a dataset, or the states of scene 3."""
+
+Differences = dict[str, list[str]]
+"""Settings that differ from the paper's by what they decide, "data" or "training"."""
+
+
+def describe_run(run: Run) -> dict[str, str]:
+    """Return preset, overrides, commit, date and machine of a run, by these names."""
+    # The record of the last run that finished in this folder.
+    path = Path(run.results, "run.yaml")
+    record = read_yaml(path) if path.is_file() else {}
+    missing = "not recorded: no run has finished in this folder"
+    return {
+        "preset": run.preset,
+        "overrides": shlex.join(run.overrides[1:]) or "none",
+        **{key: str(record.get(key, missing)) for key in ("commit", "date", "machine")},
+    }
+
+
+@cache
+def find_differences(run: Run, dataset: str) -> Differences:
+    """Return how the settings of a dataset differ from the preset `paper` without overrides.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    dataset : str
+        Option of the group dataset.
+
+    Returns
+    -------
+    dict
+        Texts such as "train.epochs = 8 instead of 100", the shortest first. Settings that no result
+        depends on, and settings of methods that the dataset does not have, are left out.
+    """
+    # The same dataset with the paper's settings.
+    own, paper = (
+        dict(leaves(drop_neutral_settings(load_dataset_config(r, dataset).model_dump())))
+        for r in (run, Run("paper", ("preset=paper",), run.results))
+    )
+    # Scene 3 has only groups of its own; other datasets also have groups of targets on request.
+    groups = {key.partition(".")[0] for key in own}
+    if dataset != SCENE3:
+        names = method_names(run, dataset)
+        groups &= DATA.union(*(method(name).groups for name in names))
+    texts: Differences = {"data": [], "training": []}
+    for key, value in own.items():
+        group = key.partition(".")[0]
+        if group in groups - {"workflow", "dataset"} and value != paper.get(key):
+            kind = "data" if group in DATA else "training"
+            texts[kind].append(f"{key} = {value} instead of {paper.get(key, 'none')}")
+    # Single numbers before long lists.
+    return {kind: sorted(differences, key=len) for kind, differences in texts.items()}
+
+
+def describe_differences(run: Run, dataset: str) -> str:
+    """Return a line on the differences of `find_differences`; empty without any.
+
+    The first difference of data and of training stands for all.
+    """
+    parts = [
+        f"not the paper's {kind}: {texts[0]}" + f" and {len(texts) - 1} more" * (len(texts) > 1)
+        for kind, texts in find_differences(run, dataset).items()
+        if texts
+    ]
+    text = "; ".join(parts)
+    return text[:1].upper() + text[1:]
+
+
+def group_warnings(run: Run) -> dict[str, list[str]]:
+    """Return the datasets of a run by the line that says how they differ from the paper."""
+    groups: dict[str, list[str]] = {}
+    for dataset in (*list_default_datasets(run), SCENE3):
+        if text := describe_differences(run, dataset):
+            groups.setdefault(text, []).append("scene 3" if dataset == SCENE3 else dataset)
+    return groups
+
+
+def describe_training(run: Run, dataset: str) -> str:
+    """Return the numbers of stars and noise levels of a dataset's trainings, in words."""
+    config = load_dataset_config(run, dataset)
+    parts = config.parts
+    return (
+        f"{parts.train_stars} stars of the split random, of which "
+        f"{parts.validation_fraction:.0%} validate, at {len(config.noise.levels)} noise levels"
+    )
+
+
+def list_table_rows(run: Run, dataset: str) -> list[list[str]]:
+    """Return the MSE of the paper's methods and of ours, × 10⁶, with headings; empty without.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    dataset : str
+        Dataset of the table.
+    """
+    path = Path(run.results, f"tables/{dataset}_mse.csv")
+    if not path.is_file():
+        return []
+    table = read_table(path, "source", "reference", "method")
+    # Three columns of texts come before the noise levels.
+    heading = [*table.columns[:3], *(f"λ = {level}" for level in table.columns[3:])]
+    rows = [[*row[:3], *(f"{1e6 * x:.4g}" for x in row[3:])] for row in table.to_numpy()]
+    return [heading, *rows]
 
 
 class ReportFile(Protocol):

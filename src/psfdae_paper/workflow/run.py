@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
@@ -23,7 +24,7 @@ from psfdae.base.settings import ConfigError, Group, Name, parse_settings
 from psfdae.commands.cli import stage
 from psfdae_paper.configuration.compose import compose, load, part, select_overrides, write_settings
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.source import SOURCES, source_hash
+from psfdae_paper.source import SOURCES, describe_machine, git_commit, source_hash
 
 BENCHMARKS = os.path.relpath(SOURCES.parent / "workflow/benchmarks")
 """Folder of the programs that measure times, relative to the working directory."""
@@ -184,7 +185,7 @@ def read_finished_run(folder: str) -> dict[str, str]:
         tree = read_yaml(record)
         if not isinstance(tree, dict):
             raise ConfigError(f"{record}: must be a mapping")
-        return tree
+        return {key: tree[key] for key in ("preset", "set") if key in tree}
     # Complete runs of earlier versions lack the record.
     return {"set": ""} if Path(folder, "runtime.csv").is_file() else {}
 
@@ -220,10 +221,19 @@ def require_same_run(run: Run) -> None:
 
 
 def record_run(run: Run) -> None:
-    """Write preset and overrides of a finished run into its folder."""
+    """Write preset and overrides of a finished run into its folder, with commit, date and machine.
+
+    The commit is the one with which the files of the run's target are up to date.
+    """
     # Sweeps and nights add to a folder without changing the run in it.
     if not (run.sweep or run.images):
-        record = {"preset": run.preset, "set": shlex.join(run.overrides[1:])}
+        record = {
+            "preset": run.preset,
+            "set": shlex.join(run.overrides[1:]),
+            "commit": git_commit(),
+            "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+            "machine": describe_machine(),
+        }
         write_text(Path(run.results, "run.yaml"), as_yaml(record))
 
 

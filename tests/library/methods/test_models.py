@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -30,6 +31,7 @@ from psfdae.methods.networks.training import Adam, DeadNetworkError, TrainingErr
 from psfdae.methods.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae_paper.methods import pca_som
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
+from psfdae_paper.source import SOURCES
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
 BASELINE = {key: value for key, value in SOM.items() if key != "seed"}
@@ -337,6 +339,12 @@ def test_errors_of_faint_stars_count_less_by_a_power_of_their_noise(data):
     errors = ((training.model(noisy) - target) ** 2).mean(dim=(1, 2, 3))
     mean_error = (errors * weight.ravel()).mean().item()
     assert training.loss((noisy, target, weight), 1).item() == pytest.approx(mean_error, rel=1e-5)
+    # The history has the mean without weights, on the scale of images of sum 1.
+    row = training.row(1, 1e-3, mean_error, float("nan"))
+    plain_error = errors.mean().item() / training.factor**2
+    assert row["train_mse"] == pytest.approx(plain_error, rel=1e-5)
+    assert plain_error != pytest.approx(mean_error / training.factor**2, rel=0.05)
+    assert row["side_px"] == target.shape[-1]
 
 
 @pytest.mark.parametrize("fused", [False, True])
@@ -429,6 +437,7 @@ def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
             next(training.batches(epoch))[:2], next(uncropped.batches(epoch))[:2], strict=True
         ):
             edge = (16 - side) // 2
+            assert training.side_px == side
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
 
 
@@ -497,3 +506,56 @@ def test_methods_have_the_functions_of_their_capabilities_and_no_others():
     for kind in all_methods():
         for function, capability in functions.items():
             assert hasattr(kind, function) == getattr(kind, capability), (kind.name, function)
+
+
+# The example of docs/developers.md
+
+
+@pytest.fixture
+def kernel_module(monkeypatch):
+    """The module of the page, with the name that the page gives it."""
+    path = SOURCES.parent / "docs/trained_kernel.py"
+    assert f"cp {path.relative_to(SOURCES.parent)} src/psfdae_paper/methods/kernel.py" in (
+        path.with_name("developers.md").read_text()
+    )
+    spec = importlib.util.spec_from_file_location("psfdae_paper.methods.kernel", path)
+    module = importlib.util.module_from_spec(spec)
+    # Annotations of dataclasses are looked up in the module.
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_learned_example_resumes_and_shows_its_epochs(
+    data, tmp_path, kernel_module, monkeypatch
+):
+    kind, seen = kernel_module.Kernel, []
+    settings = kernel_module.KernelSettings(epochs=4, lr=0.1, checkpoint_seconds=0.0)
+    monkeypatch.setattr(loop, "listener", lambda checkpoint: seen.append)
+    assert kind.name == "kernel"
+    complete = kind.fit(replace(data, checkpoint=tmp_path / "a.pt"), settings)
+    history = complete.diagnostic_rows["history.csv"]
+    assert seen == history and [row["epoch"] for row in history] == [1, 2, 3, 4]
+    assert history[-1]["validation_mse"] < 0.9 * history[0]["validation_mse"]
+    # Killed after two epochs, then begun again: the same bytes, of two more epochs.
+    run_epoch = loop.Training.run_epoch
+
+    def run_two_epochs(training):
+        if len(training.history) == 2:
+            raise KeyboardInterrupt
+        return run_epoch(training)
+
+    again = replace(data, checkpoint=tmp_path / "b.pt")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(loop.Training, "run_epoch", run_two_epochs)
+        kind.fit(again, settings)
+    seen.clear()
+    resumed = kind.fit(again, settings)
+    assert [row["epoch"] for row in seen] == [3, 4]
+    assert resumed.weights.tobytes() == complete.weights.tobytes()
+    # Its files, and what it is for.
+    noisy, _ = data.draw(data.validation, np.random.default_rng(1))
+    complete.save(tmp_path / "fit.h5", {})
+    loaded = kind.load(tmp_path / "fit.h5")
+    truth = data.references[data.validation]
+    assert mse(loaded.predict(noisy), truth).mean() < 0.5 * mse(noisy, truth).mean()

@@ -15,8 +15,9 @@ from psfdae.methods.metrics import (
     mse,
     ssim,
 )
+from psfdae_paper.evaluation import readable
 from psfdae_paper.evaluation.alignment_tables import correlate_errors
-from psfdae_paper.evaluation.paper import format_paper_table, paper_table
+from psfdae_paper.evaluation.paper import format_paper_table, paper_table, read_published
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,35 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
     assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
     assert set(table.source) == {"paper", "psfdae"}
-    assert "2.7568e-05" in format_paper_table(table, "dataset3", "mse")
+    assert (format_paper_table(table, "mse") == "2.7568e-05").any(axis=None)
+
+
+def test_methods_stand_side_by_side_with_their_errors_and_the_paper(tmp_path):
+    rows = [
+        ("dataset3", split, "template", method, 0.002, "mse", value, 3e-8, seed_stderr, 10)
+        for split in ("random", "held_out")
+        for method, value, seed_stderr in (("noisy", 1e-4, 0.0), ("dae", 2.5e-6, 4e-8))
+    ]
+    columns = [*("dataset", "split", "reference", "method"), *("noise_level", "metric")]
+    columns += ["value", "stderr", "seed_stderr", "n"]
+    table = readable.tabulate_methods(pd.DataFrame(rows, columns=columns), "mse")
+    assert list(table.columns[:6]) == ["dataset", "split", "reference", "λ", "noisy", "DAE"]
+    held_out, random = table.to_dict("records")
+    # Errors of stars and seeds add in quadrature: 0.03 and 0.04 give 0.05 millionths.
+    assert random["DAE"] == "2.500 ± 0.050" and random["noisy"] == "100.000 ± 0.030"
+    published = read_published("psf")
+    rows = published[(published.dataset == "dataset3") & (published.metric == "mse")]
+    row = rows[(rows.method == "dae") & (rows.noise_level == 0.002)].iloc[0]
+    assert float(random["DAE, paper"]) == pytest.approx(1e6 * row.value, rel=1e-3)
+    # The paper has no held-out fields.
+    assert held_out["DAE, paper"] == ""
+    readable.write_readable(tmp_path / "t.md", table, "Errors", "Not the paper's data")
+    assert "**Not the paper's data**" in (tmp_path / "t.md").read_text()
+    latex = (tmp_path / "t.tex").read_text()
+    assert r"100.000 $\pm$ 0.030" in latex and r"held\_out" in latex and latex.isascii()
+    readable.write_page(tmp_path / "t.html", [("a < b", table)], "Not the paper's data")
+    page = (tmp_path / "t.html").read_text()
+    assert page.count("<td>") == table.size and "a &lt; b" in page
 
 
 def test_correlation_is_pearson_s_with_fisher_s_interval():

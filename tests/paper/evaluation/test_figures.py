@@ -1,11 +1,25 @@
-"""Figures of scenes 1 and 2 from tiny synthetic inputs."""
+"""Figures from tiny synthetic inputs and from the tables of the record."""
 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
+import pytest
 
+import figures
+from psfdae.base.figures import apply_style
+from psfdae_paper.evaluation.alignment_figures import draw_twins
+from psfdae_paper.evaluation.curves import draw_errors, draw_training_curves
 from psfdae_paper.evaluation.figures import draw_templates
+from psfdae_paper.evaluation.paper import read_published
+from psfdae_paper.source import SOURCES
 from psfdae_paper.stars.fields import square_grid
+
+
+@pytest.fixture
+def record_table():
+    """Function that reads a table of the run of record by its name."""
+    return lambda name: pd.read_csv(SOURCES.parent / f"results/reference/tables/{name}.csv")
 
 
 def small_field():
@@ -41,3 +55,74 @@ def test_template_map_shows_the_bright_pixel_where_it_belongs():
     opposite = (x - (column - 1.5) * pixel, y - (row - 1.5) * pixel)
     assert rgb_at(figure, axes, *at).min() > 0.7
     assert rgb_at(figure, axes, *opposite).max() < 0.1
+
+
+def line_points(axes):
+    """Coordinates of all lines of a panel, and whether each joins its points."""
+    return [(line.get_xydata(), line.get_linestyle() != "None") for line in axes.get_lines()]
+
+
+def test_dissimilarity_is_drawn_on_a_logarithmic_axis(record_table):
+    metrics, paper = record_table("psf_metrics"), read_published("psf")
+    figure = draw_errors(metrics, paper, "dataset3", "ssim", "a note")
+    axes = figure.axes[0]
+    rows = metrics[(metrics.dataset == "dataset3") & (metrics.metric == "ssim")]
+    row = rows[(rows.reference == "realisation") & (rows.method == "dae")].iloc[0]
+    points = np.concatenate([points for points, _ in line_points(axes)])
+    nearest = points[np.abs(points[:, 0] - row.noise_level) < 1e-9, 1]
+    assert np.abs(nearest - (1.0 - row.value)).min() == pytest.approx(0.0, abs=1e-12)
+    assert axes.get_yscale() == "log"
+    title = figure.get_suptitle()
+    assert title.endswith("\na note") and str(row.n) in title
+
+
+def test_training_on_the_middle_of_stamps_is_not_joined_with_the_validation():
+    history = pd.DataFrame(
+        {
+            "step": [10, 20, 30, 40],
+            "train_mse": [9e-5, 8e-5, 3e-5, 2e-5],
+            "side_px": [8, 12, 16, 16],
+            "validation_mse": [np.nan, 4e-5, np.nan, 2.5e-5],
+        }
+    )
+    axes = draw_training_curves({"network": history}, "title").axes[0]
+    dashed = [line for line in axes.get_lines() if line.get_linestyle() == "--"]
+    assert [line.get_xdata().tolist() for line in dashed] == [[30, 40]]
+
+
+def test_distance_of_a_twin_is_written_in_standard_deviations():
+    curves = pd.DataFrame(
+        [(0.002, 0.0, -1.0, 243.36), (0.002, 0.0, 1.0, 0.0), (0.002, 0.1, -1.0, 400.0)],
+        columns=["noise_level", "defocus_mm", "position", "chi2"],
+    )
+    stamps = np.ones((3, 8, 8))
+    figure = draw_twins(curves, [("in focus", stamps, 0.1 * stamps)], np.zeros(4))
+    assert "15.6 σ" in [text.get_text() for text in figure.axes[0].texts]
+    by_defocus = [points for points, _ in line_points(figure.axes[1])]
+    assert by_defocus[0] == pytest.approx(np.array([(0.0, 15.6), (0.1, 20.0)]))
+
+
+def test_refused_stress_has_no_error_and_cases_are_not_joined(record_table):
+    table = record_table("stability_graded")
+    axes = apply_style(figures.graded)(table).axes[0]
+    refused = table[(table.case == "aberrations") & table.error.isna()].stress.tolist()
+    upright = [points for points, joined in line_points(axes) if joined]
+    assert refused and refused[0] in [points[0, 0] for points in upright]
+    # Upright lines alone: they go through the whole panel at one stress.
+    assert all(np.ptp(points[:, 0]) == 0 for points in upright if len(points))
+
+
+def test_memory_is_not_extrapolated(record_table):
+    table = record_table("benchmark_scaling")
+    time, memory = apply_style(figures.scaling)(table).axes[:2]
+    largest = table.stars[table.measured == "yes"].max()
+    assert max(points[:, 0].max() for points, _ in line_points(memory)) == largest
+    assert max(points[:, 0].max() for points, _ in line_points(time)) > largest
+
+
+def test_costs_say_on_which_noise_levels_they_rest(record_table):
+    table = record_table("benchmark_costs").assign(over_least_stderr=0.1)
+    titles = [axes.get_title(loc="left") for axes in apply_style(figures.costs)(table).axes]
+    for dataset, rows in table.groupby("dataset"):
+        levels = str(rows.noise_levels.iloc[0]).replace(" ", ", ")
+        assert f"{dataset}: {rows.stars.iloc[0]} stars, λ = {levels}" in titles

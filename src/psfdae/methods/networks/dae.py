@@ -345,7 +345,9 @@ class DaeTraining(Training):
     """Training on noisy images, with new noise in every epoch or the same noise in all epochs.
 
     It may begin with the middle of the stamps, where an epoch takes less time. The history
-    has MSEs of flux-normalised images. Another attempt uses other initial weights and noise.
+    has MSEs of flux-normalised images, without the weights of the loss: `train_mse` of the pixels
+    that the epoch trains on, a square of `side_px` pixels a side, and `validation_mse` of whole
+    stamps. Another attempt uses other initial weights and noise.
 
     Parameters
     ----------
@@ -397,6 +399,9 @@ class DaeTraining(Training):
         # The last batch of an epoch may be smaller.
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
+        # Unweighted errors of the batches of an epoch, and the side of the stamps in it.
+        self.batch_errors: list[torch.Tensor] = []
+        self.side_px = data.images.shape[-1]
         # One noisy image of every star for all epochs, with the setting "fixed".
         self.constant_draw: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
@@ -437,7 +442,8 @@ class DaeTraining(Training):
         side = self.data.images.shape[-1]
         crop_epochs = int(self.settings.crop_epochs * self.settings.epochs)
         part = epoch / crop_epochs if crop_epochs else 1.0
-        edge = (side - middle_px(side, part, self.data.reference)) // 2
+        self.side_px, self.batch_errors = middle_px(side, part, self.data.reference), []
+        edge = (side - self.side_px) // 2
         # Every star once, in random order.
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
@@ -473,8 +479,11 @@ class DaeTraining(Training):
         # Not at every step, because reading the values waits for the computation.
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
-        # (1/n) Σ w (f(z) − y)² over the pixels of all stars.
-        return (weight * (output - target) ** 2).mean()
+        # (1/n) Σ w (f(z) − y)² over the pixels of all stars. The history has the mean without
+        # weights, which the validation error can be compared with.
+        squares = (output - target) ** 2
+        self.batch_errors.append(squares.detach().mean())
+        return (weight * squares).mean()
 
     def validate(self, epoch: int) -> float:
         """Return the mean squared error of the validation stars, of sum 1.
@@ -514,8 +523,9 @@ class DaeTraining(Training):
             "epoch": epoch,
             "step": epoch * self.steps,
             "lr": rate,
-            "train_mse": loss / self.factor**2,
+            "train_mse": torch.stack(self.batch_errors).mean().item() / self.factor**2,
             "validation_mse": error,
+            "side_px": self.side_px,
             "seconds": round(self.seconds, 3),
             "cpu_seconds": round(self.cpu_seconds, 3),
         }

@@ -68,12 +68,11 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     return table
 
 
-def format_paper_table(table: pd.DataFrame, dataset: str, metric: str) -> str:
-    """Return a table of `paper_table` as Markdown, MSE in scientific notation."""
+def format_paper_table(table: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Return a table of `paper_table` as texts, MSE in scientific notation."""
     digits = ".4e" if metric == "mse" else ".4f"
     text_table = table.copy()
     for column in text_table.columns[3:]:
         text_table[column] = text_table[column].map(lambda value: format(value, digits))
     text_table.columns = [*text_table.columns[:3], *(f"λ = {c}" for c in text_table.columns[3:])]
-    body = text_table.to_markdown(index=False, disable_numparse=True)
-    return f"{metric.upper()} of {dataset}, split random\n\n{body}\n"
+    return text_table

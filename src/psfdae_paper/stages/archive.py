@@ -1,0 +1,179 @@
+"""Stages `archive` and `fetch`: a finished run as one file, and such a file unpacked and verified.
+
+The file is a tar archive without compression, because most products are compressed already, and so
+that a damaged byte belongs to one member. Its members are named relative to the run's folder; the
+first one, SHA256SUMS, has the checksums of all others.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+from psfdae.base.errors import Error
+from psfdae.base.files import ProductError, atomic_path, compute_sha256
+from psfdae.base.options import File, Folder
+from psfdae.base.progress import steps
+from psfdae_paper.configuration.command import command
+from psfdae_paper.source import SOURCES
+from psfdae_paper.stages.manifest import CHECKSUMS
+
+CITATION = "CITATION.cff"
+RUN_FILES = ("run.yaml", "runtime.csv", "report.html")
+"""Files of a run that its checksums leave out: settings, costs and report."""
+MAX_CHECKSUMS_B = 2**26
+"""Largest size of the list of checksums, in bytes; some 500,000 files."""
+
+
+class ArchiveError(Error, RuntimeError):
+    """A file that is no archive of a run, is damaged, or would write outside its folder."""
+
+
+@command("paper archive")
+def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
+    """Write a finished run as one file: products, models, report, checksums and citation.
+
+    Products are the files of SHA256SUMS; a file that has changed since is an error.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run, with its report.
+    out : Path
+        Tar archive.
+    """
+    manifest = results / CHECKSUMS
+    if not manifest.is_file():
+        raise ProductError(f"{manifest}: missing; `psfdae paper manifest` writes it")
+    recorded = read_checksums(manifest.read_text())
+    paths = {name: results / name for name in (*RUN_FILES, *recorded)}
+    paths[CITATION] = SOURCES.parent / CITATION
+    for name, path in paths.items():
+        if not path.is_file():
+            raise ProductError(f"{path}: missing; {name} belongs to a run that make has finished")
+    # A product that was damaged after the run must not get a new, fitting checksum.
+    sums = {}
+    for name, path in steps("checksums", paths.items()):
+        sums[name] = compute_sha256(path)
+        if recorded.get(name, sums[name]) != sums[name]:
+            raise ProductError(f"{path}: differs from its checksum in {manifest}")
+    lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items()).encode()
+    with atomic_path(out) as temporary, tarfile.open(temporary, "w") as tar:
+        # The checksums come first, so that every member is verified when it is read.
+        member = tarfile.TarInfo(CHECKSUMS)
+        member.size, member.mode = len(lines), 0o644
+        tar.addfile(member, BytesIO(lines))
+        for name, path in steps("files", paths.items()):
+            # Times stay, by which Snakemake knows that products are up to date; owners do not.
+            member = tar.gettarinfo(path, name)
+            member.uid = member.gid = 0
+            member.uname = member.gname = ""
+            member.mode = 0o644
+            with path.open("rb") as file:
+                tar.addfile(member, file)
+
+
+def read_checksums(text: str) -> dict[str, str]:
+    """Return checksums by name from lines as `sha256sum` prints them.
+
+    Raises
+    ------
+    ArchiveError
+        If a line has another form, or a name leads out of the folder.
+    """
+    sums = {}
+    for line in text.splitlines():
+        digest, _, name = line.partition("  ")
+        path = PurePosixPath(name)
+        if len(digest) != 64 or not name or path.is_absolute() or ".." in path.parts:
+            raise ArchiveError(f"{CHECKSUMS}: wrong line {line[:80]!r}")
+        sums[name] = digest
+    return sums
+
+
+@command("paper fetch")
+def fetch(file: Annotated[File, {"argument": True}], results: Folder) -> None:
+    """Unpack FILE of the command archive into the folder of a run, and verify it.
+
+    Nothing is written into the folder unless all checksums agree. Members other than plain files
+    inside the folder are rejected.
+
+    Parameters
+    ----------
+    file : Path
+        Tar archive.
+    results : Path
+        Folder of the run; it must not hold any of the archive's files.
+    """
+    results.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the folder, on the same file system, so that complete files are moved into it.
+    place = TemporaryDirectory(prefix=".fetch-", dir=results.parent)
+    with place as temporary, explain_damage(file):
+        folder = Path(temporary)
+        unpack(file, folder)
+        entries = sorted(folder.iterdir())
+        for entry in entries:
+            if (results / entry.name).exists():
+                raise ArchiveError(
+                    f"{results / entry.name}: exists; name a folder without a run (RESULTS=…)"
+                )
+        # The run counts as finished with its record, which comes last.
+        results.mkdir(exist_ok=True)
+        for entry in sorted(entries, key=lambda path: path.name == RUN_FILES[0]):
+            shutil.move(entry, results / entry.name)
+
+
+@contextmanager
+def explain_damage(file: Path) -> Iterator[None]:
+    """Raise an ArchiveError with the name of the file where tarfile or the system fails."""
+    try:
+        yield
+    except (tarfile.TarError, EOFError, UnicodeDecodeError, OSError) as error:
+        raise ArchiveError(f"{file}: truncated, damaged or not an archive of a run: {error}") from (
+            None
+        )
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """Unpack an archive into an empty folder, and compare every member with its checksum.
+
+    Parameters
+    ----------
+    file : Path
+        Tar archive.
+    folder : Path
+        Empty folder.
+
+    Raises
+    ------
+    ArchiveError
+        If the archive lacks a file, has another one, or a file differs from its checksum; if a
+        member is a link, or lies outside the folder.
+    """
+    with tarfile.open(file, "r:") as tar:
+        first = tar.next()
+        content = tar.extractfile(first) if first and first.name == CHECKSUMS else None
+        if first is None or content is None or first.size > MAX_CHECKSUMS_B:
+            raise ArchiveError(f"{file}: does not begin with {CHECKSUMS}: no archive of a run")
+        text = content.read().decode()
+        missing = read_checksums(text)
+        (folder / CHECKSUMS).write_text(text)
+        for member in steps("files", iter(tar.next, None)):
+            if not member.isreg():
+                raise ArchiveError(f"{file}: {member.name}: not a plain file")
+            # Each file once, and none without a checksum; names of checksums stay in the folder.
+            digest = missing.pop(member.name, None)
+            if digest is None:
+                raise ArchiveError(f"{file}: {member.name}: has no checksum, or appears twice")
+            # The filter rejects absolute paths, `..` and links once more.
+            tar.extract(member, folder, filter="data")
+            if compute_sha256(folder / member.name) != digest:
+                raise ArchiveError(f"{file}: {member.name}: damaged, differs from its checksum")
+    if missing:
+        raise ArchiveError(f"{file}: lacks {next(iter(missing))} (truncated?)")
