@@ -188,11 +188,14 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
 def noise_correlation(deviation: np.ndarray) -> float:
     """Return the noise of sums of pixels over sums of independent pixels, at least 1.
 
-    It is √(Σ ρ) over the correlations ρ of pixels up to 2 px apart. Faint sources and structure of
-    the sky correlate pixels 3 and 4 px apart nearly as much as neighbours, along rows and columns
-    alike; the ρ at these distances is due to them, and is subtracted. A larger ρ along rows or
-    columns only is noise: offsets of rows or columns, as from 1/f noise. The result is 1 unless
-    0.15 remain of the correlation of neighbours then, or 0.05 along rows or columns.
+    It is √(Σ ρ a) over the correlations ρ of pixels up to 2 px apart, where a is the
+    autocorrelation of the image's bright sources: in a sum that is weighted by a PSF, pixels
+    farther apart share less. Without five bright sources a is 1, as in sums over many pixels. Faint
+    sources and structure of the sky correlate pixels 3 and 4 px apart nearly as much as neighbours,
+    along rows and columns alike; the ρ at these distances is due to them, and is subtracted. A
+    larger ρ along rows or columns only is noise: offsets of rows or columns, as from 1/f noise. The
+    result is 1 unless 0.15 remain of the correlation of neighbours then, or 0.05 along rows or
+    columns.
 
     Parameters
     ----------
@@ -220,11 +223,52 @@ def noise_correlation(deviation: np.ndarray) -> float:
     if nearest - structure - 0.5 * offsets < 0.15:
         # Offsets alone: pixels of a row up to 2 px apart on both sides.
         return float(np.sqrt(1.0 + 4.0 * offsets)) if offsets > 0.05 else 1.0
-    # √(1 + 2 Σ ρ): each lag stands for itself and its opposite.
+    # √(1 + 2 Σ ρ a): each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
-    excess = sum(_correlation(values, *lag) - structure for lag in lags)
+    noise_shares = np.array([_correlation(values, *lag) for lag in lags])
+    source_shares = correlate_sources(deviation[middle], lags, noise_shares)
+    excess = float((noise_shares - structure) @ source_shares)
     excess /= max(1.0 - structure, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
+
+
+def correlate_sources(
+    deviation: np.ndarray,
+    lags: Sequence[tuple[int, int]],
+    noise_correlations: np.ndarray,
+    least_sigma: float = 8.0,
+) -> np.ndarray:
+    """Return the autocorrelation of bright sources at lags (rows, columns), its median, 0 … 1.
+
+    It is 1 with fewer than five sources of `least_sigma` that have no bad pixel within 6 px.
+
+    Parameters
+    ----------
+    deviation : ndarray, shape (h, w)
+        Pixels without their sky, in σ; NaN where they are ignored.
+    lags : sequence of (int, int)
+        Offsets of up to 2 px.
+    noise_correlations : ndarray, shape (k,)
+        Correlation of the noise at these lags.
+    least_sigma : float
+        Minimum height of the brightest pixel of a source.
+    """
+    # Local maxima, the 300 brightest, and windows of 9 × 9 px about them and a lag away.
+    clean = np.nan_to_num(deviation)
+    is_peak = (clean > least_sigma) & (clean == scipy.ndimage.maximum_filter(clean, 9))
+    row, column = np.nonzero(is_peak)
+    brightest = np.argsort(-clean[row, column], kind="stable")[:300]
+    row, column = row[brightest] + 2, column[brightest] + 2
+    wide_image = np.pad(deviation, 6, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
+    own, *others = (windows[row + down, column + across] for down, across in [(0, 0), *lags])
+    # Products of a source with itself; the noise of 81 pixels adds its own.
+    products = np.array([(own * other).sum(axis=(1, 2)) for other in (own, *others)])
+    products -= own[0].size * np.append(1.0, noise_correlations)[:, None]
+    products = products[:, np.isfinite(products).all(axis=0)]
+    if products.shape[1] < 5:
+        return np.ones(len(lags))
+    return np.clip(np.median(products[1:] / products[0], axis=1), 0.0, 1.0)
 
 
 def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> float:

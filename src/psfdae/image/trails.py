@@ -123,25 +123,45 @@ def find_spikes(
             continue
         # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
         rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
-        # The lower quartile of a part: a row of separate stars has dark gaps, a spike has none.
-        quartile = np.percentile(rays.reshape(angles, parts, part_px), 25, axis=2)
-        light = np.ma.masked_invalid(quartile)
-        light -= np.ma.median(light, axis=0)
-        # Parts with light: 0.6 σ is three times the noise of a part; halos are uneven.
-        scatter = SIGMA_OF_MAD * np.ma.median(np.abs(light), axis=0)
-        is_light = (light > np.maximum(4.0 * scatter, 0.6)).filled(False)
-        # A ray ends at the last part with light, of which three of four from the core on have some.
-        is_light = is_light[:, first:]
-        share = np.cumsum(is_light, axis=1) / np.arange(1, parts - first + 1)
-        length = ((is_light & (share >= 0.75)) * np.arange(1, parts - first + 1)).max(axis=1)
-        end_px = np.where(length >= 3, first + length, 0) * part_px
-        # Pixels of these rays outside of the core, in a window about it.
+        quartiles = np.percentile(rays.reshape(angles, parts, part_px), [25, 75], axis=2)
+        quartiles = quartiles[:, :, first:]
+        is_outside = ~np.isfinite(quartiles)
+        quartiles[is_outside] = 0.0
+        number = np.arange(1, parts - first + 1)
+        end_px = np.zeros(angles)
+        # Faint spikes are seen in several parts together, by a low percentile of these, which stars
+        # in some of them do not change.
+        for run in (1, 5):
+            light = scipy.ndimage.rank_filter(quartiles, run // 3, (1, 1, run), mode="mirror")
+            # Without the halo, which may be uneven or off its middle: the median within 30° at the
+            # same distance, of every eighth ray. A spike is narrower.
+            halo = scipy.ndimage.median_filter(light[:, ::8], (1, 15, 1), mode="wrap")
+            light = np.ma.array(light - np.repeat(halo, 8, axis=1), mask=is_outside)
+            # The lower quartile of a part: a row of separate stars has dark gaps, a spike has none.
+            low, high = light
+            # Parts with light: 0.6 σ is three times the noise of a part.
+            scatter = SIGMA_OF_MAD * np.ma.median(np.abs(low), axis=0)
+            limit = np.maximum(4.0 * scatter.filled(np.inf), 0.6 / np.sqrt(run))
+            # Spikes come in opposite pairs, of which each is evidence of the other.
+            both = np.ma.minimum(low, np.roll(low, angles // 2, axis=0))
+            is_light = (low > limit).filled(False) | (both > 0.5 * limit).filled(False)
+            is_light &= (low > 0.4 * high).filled(False)
+            # A ray ends at the last part with light, of which three of four from the core on have
+            # some, but for the first ones in which the halo is so uneven that it hides spikes.
+            is_hidden = np.logical_and.accumulate(limit > 2.0 * np.median(limit))
+            count = np.cumsum(is_light, axis=1)
+            is_ray = is_light & (count >= 0.75 * np.cumsum(is_light | ~is_hidden, axis=1))
+            length = (is_ray & (count >= max(3, run))) * number
+            end_px = np.maximum(end_px, (first + length.max(axis=1)) * part_px)
+        # Pixels of these rays from the core on, in a window about it.
         window, _ = overlap_slices(image.shape, (2 * reach_px + 1,) * 2, (int(y), int(x)))
         row, column = np.mgrid[window] - np.array(middle)[:, None, None]
         turns = np.arctan2(row, column) / (2.0 * np.pi) % 1.0
         ray = (turns * angles).astype(int) % angles
         radius = np.hypot(row, column)
-        spikes[window] |= (radius < end_px[ray]) & (radius > first * part_px)
+        spikes[window] |= (
+            (end_px[ray] > first * part_px) & (radius < end_px[ray]) & (radius > core_px)
+        )
     return np.asarray(scipy.ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
 
 

@@ -156,7 +156,10 @@ def photometry(
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
-        if turn == turns - 1 or (turn > 0 and observation.detections is None):
+        # Two fits at least; one more with halos, whose first measurement lacks the light that the
+        # first fluxes have too much.
+        is_last = turn > (1 if halo_error.any() else 0)
+        if turn == turns - 1 or (is_last and observation.detections is None):
             break
         # A star found in residuals is dropped if it is faint, if it may be what the PSF of another
         # star lacks, or if it has moved to another star.
@@ -173,7 +176,7 @@ def photometry(
             new, new_flux = find_stars(psfs, sky.flat, sigma, positions, threshold, fwhm)
             place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
             flux = np.append(flux, new_flux)
-        if turn > 0 and real.all() and len(place) == len(real):
+        if is_last and real.all() and len(place) == len(real):
             break
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
@@ -185,8 +188,10 @@ def photometry(
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
     light = fit.light + wing_light
-    result = CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio)
-    return result.times(1.0 / unit)  # in the unit of the image
+    # In the unit of the image.
+    return CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio).times(
+        1.0 / unit
+    )
 
 
 def find_duplicates(

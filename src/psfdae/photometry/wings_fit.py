@@ -39,6 +39,10 @@ class StarFluxes(NamedTuple):
     flux: np.ndarray
     outer_share: np.ndarray
 
+    def select(self, rows: np.ndarray) -> StarFluxes:
+        """Return some of the stars."""
+        return StarFluxes(*(values[rows] for values in self))
+
 
 def star_tents(
     rows: slice, width: int, stars: StarFluxes, wings: Wings
@@ -277,14 +281,63 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
-    # Saturated stars have halos that the fit of a few pixels, or of a neighbour, does not know.
-    halo_error = np.zeros_like(sky.flat)
-    for core in find_saturated_cores(is_saturated):
-        if (halo := measure_halo(sky.flat, sky.bad, sigma, core)) is not None:
-            light_of_wings[halo.window] += halo.light
-            sky.flat[halo.window] -= halo.light
-            halo_error[halo.window] = np.hypot(halo_error[halo.window], halo.error)
+    halo_error = subtract_halos(
+        sky.flat, light_of_wings, sky.bad, sigma, stars, wings, is_saturated
+    )
     return sky, light_of_wings, wings, halo_error
+
+
+def subtract_halos(
+    residual: np.ndarray,
+    light_of_wings: np.ndarray,
+    bad: np.ndarray,
+    sigma: np.ndarray,
+    stars: StarFluxes,
+    wings: Wings | None,
+    is_saturated: np.ndarray,
+) -> np.ndarray:
+    """Subtract the halos of saturated cores, which the fit of a few pixels does not know.
+
+    The wings of stars on the cores are a part of the halos, which need not be round as wings are.
+
+    Parameters
+    ----------
+    residual, light_of_wings : ndarray, shape (h, w)
+        Image without sky and stars, and light of wings: changed here.
+    bad, is_saturated : ndarray of bool, shape (h, w)
+        Pixels that do not count, and saturated ones.
+    sigma : ndarray, shape (h, w)
+        σ of the pixels.
+    stars : StarFluxes
+        Positions and fluxes of the stars.
+    wings : Wings or None
+        Wings that were subtracted.
+
+    Returns
+    -------
+    ndarray, shape (h, w)
+        Standard error of the halos in a pixel, which neighbours share.
+    """
+
+    def move_wings(rows: np.ndarray, sign: float) -> None:
+        """Add wings of some stars to the residual, or subtract them."""
+        if rows.any():
+            light = sign * draw_wings(residual.shape, stars.select(rows), wings)
+            residual[:] += light
+            light_of_wings[:] -= light
+
+    cores, halo_error = find_saturated_cores(is_saturated), np.zeros_like(residual)
+    distance = np.hypot(*(stars.place[:, None] - cores[:, :2]).T)
+    is_on_core = distance < cores[:, 2:] + 1.0
+    move_wings(is_on_core.any(axis=0), 1.0)
+    for core, is_on_this in zip(cores, is_on_core, strict=True):
+        if (halo := measure_halo(residual, bad, sigma, core)) is None:
+            move_wings(is_on_this, -1.0)  # the wings are all that is known of its light
+            continue
+        light_of_wings[halo.window] += halo.light
+        residual[halo.window] -= halo.light
+        halo_error[halo.window] = np.hypot(halo_error[halo.window], halo.error)
+    return halo_error
 
 
 class Halo(NamedTuple):
@@ -307,10 +360,11 @@ class Halo(NamedTuple):
 def measure_halo(
     residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
 ) -> Halo | None:
-    """Measure the light that is left around a saturated core: at each distance, the median.
+    """Measure the light that is left around a saturated core: in each ring, the median.
 
-    It ends at the first ring of which the median is below five times its error; farther out, it
-    falls off as the power of the distance that the last four rings follow, up to 256 px.
+    Rings are ellipses of one shape, which is fitted with their centre. The halo ends at the first
+    ring of which the median is below five times its error; farther out, it falls off as the power
+    of the distance that the last four rings follow, up to 256 px.
 
     Parameters
     ----------
@@ -334,11 +388,13 @@ def measure_halo(
         for at, size in zip((row, column), residual.shape, strict=True)
     )
     data, noise, middle = residual[window], sigma[window], core[1::-1].astype(float)
-    # Rings wider by a tenth each.
+    # Rings wider by a tenth each; `shape` turns ellipses into circles.
     edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
-    for _ in range(3):
+    shape = np.eye(2)
+    for _ in range(5):
         offset = np.mgrid[window] - middle[:, None, None]
-        radius = np.hypot(*offset)
+        round_offset = np.tensordot(shape, offset, 1)
+        radius = np.hypot(*round_offset)
         ring = np.where(bad[window], 0, np.digitize(radius, edges))
         # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
         numbers = np.setdiff1d(ring, [0, len(edges)])
@@ -362,15 +418,26 @@ def measure_halo(
         height = np.interp(log_r, log_radius[:count], scaled_level)
         light = height * np.exp(slope * np.maximum(log_r - end, 0.0) - 3.0 * np.minimum(log_r, end))
         light[radius >= 256.0] = 0.0
-        # The centre is known to half a pixel: an offset δ leaves −δ ∇h. Least squares of δ,
-        # where uneven light counts as an error of 30 %.
+        # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
+        # stretches g₁ along the axes and g₂ along the diagonals leave r h' (g₁ cos 2φ + g₂ sin 2φ).
+        # Least squares, where uneven light counts as an error of 30 %.
         doubt = np.hypot(noise, 0.3 * light)
         is_fitted = (ring > 0) & (log_r < end) & (np.abs(data - light) < 3.0 * doubt)
-        design = np.stack(np.gradient(light))[:, is_fitted] / doubt[is_fitted]
-        shift = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
-        middle += np.clip(shift, -1.0, 1.0)
-    # A halo is not round: medians in eighths of a ring scatter by more than noise does, √8 times
-    # the error of the ring. σ² = their mean square less seven of these; half of the light outside.
+        slopes = np.stack(np.gradient(light))
+        along = (slopes * offset).sum(axis=0) / np.maximum(radius, 1.0) ** 2  # h'/r
+        stretches = [
+            -along * (round_offset[0] ** 2 - round_offset[1] ** 2),
+            -along * 2.0 * round_offset[0] * round_offset[1],
+        ]
+        design = np.stack([*slopes, *stretches])[:, is_fitted] / doubt[is_fitted]
+        change = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
+        middle += np.clip(change[:2], -1.0, 1.0)
+        along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
+        stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
+        shape = stretch @ shape
+    # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, √8
+    # times the error of the ring. σ² = their mean square less seven of these; half of the light
+    # outside.
     eighth = np.floor(np.arctan2(*offset) * 4.0 / np.pi).astype(int) % 8
     parts = numbers[:count, None] * 8 + np.arange(8)
     uneven = ndimage.median(data - light, ring * 8 + eighth, parts.ravel()).reshape(parts.shape)

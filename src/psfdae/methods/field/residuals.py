@@ -95,8 +95,9 @@ def residual_covariance(
     signal = np.median(np.maximum(np.square(core).sum(axis=(1, 2)) - noise_square, 0.0))
     weight = (signal + 1e-12) / (signal + 1e-12 + noise_square)
     weight /= weight.sum()
-    # A shift by splines averages noise: half of its variance remains, and is not part of C.
-    noise_variance = 0.5 * float(weight @ noise**2)
+    # A shift by splines averages noise: half of its variance remains, and is not part of C. The
+    # noise of all pixels is in as many components as there are stars, if these are fewer.
+    noise_variance = 0.5 * float(weight @ noise**2) * max(side**2 / len(residual), 1.0)
     # Matrices that shift the star from its centre to each phase, along rows and columns.
     shifts = list_phases(step_px)[:, None, None] - centre
     rows, columns = (
