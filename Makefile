@@ -64,7 +64,6 @@ benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
 	*) $(LOCKED) -- $@;; esac
-
 night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list of images
 	@$(LOCKED) images="$$IMAGES" -- night
 
@@ -73,7 +72,6 @@ report: env ## Gather the figures of a finished run in results/report.html
 
 archive: report ## A finished run as one file, FILE=run.tar: results, models, report, checksums, citation
 	psfdae paper archive "$$PSFDAE_RESULTS" --out "$${FILE:-psfdae-run.tar}"
-
 fetch: env ## Unpack and verify FILE=run.tar in place of computing it
 	psfdae paper fetch "$${FILE:-psfdae-run.tar}" --results "$$PSFDAE_RESULTS"
 
@@ -81,10 +79,8 @@ mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f "$$PSFDAE_RESULTS/mlflow.db" || { echo "no $$PSFDAE_RESULTS/mlflow.db yet: make reproduce"; exit 1; }
 	mlflow ui --workers 1 --port "$${PORT:-5000}" --backend-store-uri "sqlite:///$$PSFDAE_RESULTS/mlflow.db" \
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
-
 reference: env ## Make the finished run in results the run of record
 	@sh workflow/reference.sh
-
 site: env ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
@@ -94,7 +90,6 @@ lint: env ## Check style, words and types of Python, and Snakemake files
 	python workflow/house.py
 	mypy
 	snakefmt --check Snakefile workflow && snakemake --lint
-
 format: env ## Format Python and Snakemake files
 	ruff check --fix . && ruff format . && snakefmt Snakefile workflow
 
@@ -117,7 +112,6 @@ test-pythons: env ## The fast tests with other Pythons, and the newest or lowest
 
 dist: env ## Build the source distribution and the wheel in dist/
 	uv build --no-build-isolation --python .venv/bin/python --out-dir dist
-
 lock: env ## Renew the lock files from pyproject.toml and requirements; torch's CPU builds from TORCH_INDEX
 	sh requirements/lock.sh
 
