@@ -268,7 +268,7 @@ def correlate_sources(
     products = products[:, np.isfinite(products).all(axis=0)]
     if products.shape[1] < 5:
         return np.ones(len(lags))
-    return np.clip(np.median(products[1:] / products[0], axis=1), 0.0, 1.0)
+    return np.asarray(np.clip(np.median(products[1:] / products[0], axis=1), 0.0, 1.0))
 
 
 def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> float:

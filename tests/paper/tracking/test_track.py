@@ -12,9 +12,13 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import yaml
 
+from psfdae.base.files import write_text
+from psfdae_paper import tracking
+from psfdae_paper.configuration.estimators import Estimator, list_trained_networks
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import read_dataset_runs
 from tracked_results import ALL, write_config, write_history, write_stars, write_tree
@@ -182,6 +186,37 @@ def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     assert attempt.content_hash != content_hash
     write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
     assert read_dataset_runs(tmp_path, stars)[2].config_hash != first.config_hash
+
+
+def test_scene_3_and_a_night_are_read_from_their_tables(tmp_path):
+    errors = tmp_path / "tables/alignment_errors.csv"
+    errors.parent.mkdir()
+    shutil.copy(ROOT / "results/reference/tables/alignment_errors.csv", errors)
+    for kind in ("dae", *list_trained_networks()):
+        folder = tmp_path / "alignment" / kind
+        folder.mkdir(parents=True)
+        for name in ("dae.safetensors", Estimator.weights_file):
+            (folder / name).write_bytes(b"weights")
+        (folder / "config.yaml").write_text("seed: 7\nattempt: 1\n")
+        write_history(folder / "history.csv")
+    runs = {run.key[0]: run for run in tracking.read_alignment_runs(tmp_path)}
+    assert runs.keys() == {"dae", *list_trained_networks()}
+    table = pd.read_csv(errors).query("test_set == 'grid' and unit == 'range'")
+    row = table.query("method == 'original' and noise_level == 0.002 and parameter == 'tilt_y'")
+    metrics = runs["original"].metrics
+    assert metrics["grid_tilt_y_bias_0.002"] == pytest.approx(row.bias.item())
+    assert metrics["grid_tilt_y_mean_abs_error_0.002"] == pytest.approx(row.mean_abs_error.item())
+    assert runs["original"].config == {"seed": 7} and len(runs["original"].epochs) == 3
+
+    night = tmp_path / "night/night.csv"
+    header = "image,name,time,verdict,reason,stars,zero_point,seeing"
+    rows = ["a.fits,a,2026-01-01T00:00:00,poor,clouds,12,25.5,1.5", "b.fits,b,,failed,,,,"]
+    write_text(night, "\n".join([header, *rows, ""]))
+    write_text(tmp_path / "night/images/a.psf.safetensors", "model")
+    (run,) = tracking.read_night_runs(tmp_path)
+    assert run.metrics == {"stars": 12, "zero_point": 25.5, "seeing": 1.5}
+    assert run.tags == {"verdict": "poor", "reason": "clouds", "time": "2026-01-01T00:00:00"}
+    assert (run.name, run.config, run.bundle is None) == ("a", {"image": "a.fits"}, False)
 
 
 def test_moved_results_still_open(site):
