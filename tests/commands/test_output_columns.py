@@ -143,7 +143,9 @@ def folder(tmp_path_factory):
     words = (out / "image.fits", "--catalogue", out / "image.csv", "--origin", 0)
     words += ("--model", bundle(out))
     printed("predict", *words, "--out", out / "predict.fits")
-    printed("photometry", *words, "--out", out / "photometry.fits", "--zero-point", ZERO_POINT)
+    zero_point = ("--zero-point", ZERO_POINT)
+    output = printed("photometry", *words, "--out", out / "photometry.fits", *zero_point)
+    assert "no magnitudes" not in output
     return out
 
 
@@ -350,8 +352,11 @@ def test_errors_of_photometry_grow_with_chi2(folder, stars, true, model):
     """A gain that is four times too large: χ² is the ratio of the variances, errors are √χ²."""
     out, gain = folder / "gain.fits", 4 * known.GAIN
     words = ("--catalogue", folder / "image.csv", "--origin", 0, "--gain", gain)
-    printed("photometry", folder / "image.fits", *words, "--model", bundle(folder), "--out", out)
+    output = printed(
+        "photometry", folder / "image.fits", *words, "--model", bundle(folder), "--out", out
+    )
     table, bright = Table.read(out), true["bright"]
+    assert "mag" not in table.colnames and "no magnitudes: --zero-point" in output
     wrong = known.truth(stars, 30.0, STAMP, true["box"], gain)
     assert np.median(wrong["chi2"][bright]) > 1.8
     assert ratio(wrong["chi2"], 0.15, bright)(table["chi2"])

@@ -29,7 +29,7 @@ def test_numbers_in_sentences_are_those_of_the_tables(page):
     assert expected and [sentence for sentence in expected if sentence not in text] == []
 
 
-def test_every_number_in_the_prose_of_the_readme_is_in_such_a_sentence():
+def test_the_prose_in_the_readme_has_no_other_number():
     text = " ".join(re.sub(r"^```.*?^```", "", read("README.md"), flags=re.M | re.S).split())
     for sentence in sentences.SENTENCES["README.md"]():
         text = text.replace(" ".join(sentence.split()), "")

@@ -13,13 +13,13 @@ GIVEN = re.search(r"^GIVEN := (.*)", read("Makefile"), re.M)[1].split()
 
 
 def test_it_is_short_and_its_head_lists_what_a_user_may_give():
-    head, _, rest = read("Makefile").partition("\nGIVEN")
-    assert len(rest.splitlines()) + len(head.splitlines()) <= 120
+    head, _, body = read("Makefile").partition("\nGIVEN")
+    assert len(body.splitlines()) + len(head.splitlines()) <= 120
     assert {*re.findall(r"\b([A-Z_]{3,})=", head)} == {*GIVEN}
 
 
 @pytest.mark.parametrize("name", GIVEN)
-def test_what_a_user_gives_is_no_part_of_a_recipe(name, tmp_path):
+def test_no_recipe_contains_what_a_user_gives(name, tmp_path):
     """Recipes read it from the environment: neither make nor a shell can run what is in it."""
     text = f"$(shell touch {tmp_path}/make)$$(touch {tmp_path}/shell)"
     run = captured(

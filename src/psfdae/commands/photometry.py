@@ -71,3 +71,5 @@ def photometry_command(
             write_fits(residual, photometry.residual.to_hdu()[0])
     count = np.count_nonzero(np.isfinite(photometry.table["flux"]))
     print(f"{out}: {len(photometry.table)} stars, {count} measured", *photometry.notes, sep="\n")
+    if "mag" not in photometry.table.colnames:
+        print("no magnitudes: --zero-point, or --reference with a list of some, gives them")
