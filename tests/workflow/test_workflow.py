@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from skimage.metrics import mean_squared_error, structural_similarity
 
 from docs_pages import read
@@ -115,7 +116,21 @@ def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path
     first = json.loads(re.search(r"var workflow_desc = (\".*\");\n", report.read_text())[1])
     assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == 3
     assert "'results/figures/dataset3/strip_realisation.png'" in first
-    words = " ".join(re.sub("<[^>]+>", "", first).split())
+    words = " ".join(re.sub("<[^>]+>", " ", first).split())
+    # Which run it is, and that it is not the paper's, stand before the pictures; the errors of the
+    # paper and of the run are side by side.
+    screen = words.partition("Wide-field")[0]
+    record = yaml.safe_load((smoke / "results/run.yaml").read_text())
+    assert f"preset smoke overrides none commit {record['commit']}" in screen
+    assert record["date"] in screen and record["machine"] in screen
+    for name in ("dataset3", "dataset7", "scene 3"):
+        assert f"{name}: Not the paper's data: " in screen
+    table = pd.read_csv(smoke / "results/tables/dataset3_mse.csv").set_index("source")
+    for source, value in table["0.003"].items():
+        assert f"{1e6 * value:.4g}" in words.partition(source)[2]
+    for name in ("dataset3", "alignment", "methods"):
+        page = (smoke / f"results/pages/{name}.html").read_text()
+        assert page.count("<table") >= 2 and "Not the paper&#x27;s data" in page
     config = load(["dataset=dataset7", "preset=smoke"])
     for label in (
         *(method(name).look.label for name in config.methods),

@@ -31,17 +31,18 @@ rule alignment_paper_tables:
         errors=rules.alignment_tables.output.errors,
         correlation=rules.alignment_tables.output.correlation,
     output:
-        [f"{RESULTS}/tables/alignment_paper_{t}.md" for t in alignment.PAPER_TABLES],
-        [
-            report(
-                f"{RESULTS}/tables/alignment_paper_{t}.csv",
-                caption="../report/alignment_tables.rst",
-                category=datasets.SCENE_HEADINGS["scene3"],
-                subcategory="tables",
-                labels={"figure": shown},
-            )
-            for t, shown in alignment.PAPER_TABLES.items()
-        ],
+        expand(
+            f"{RESULTS}/tables/alignment_paper_{{table}}.{{ending}}",
+            table=alignment.PAPER_TABLES,
+            ending=["csv", "md", "tex"],
+        ),
+        page=report(
+            f"{RESULTS}/pages/alignment.html",
+            caption="../report/alignment_tables.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="tables",
+            labels={"figure": "tables beside the paper's"},
+        ),
     log:
         f"{RESULTS}/logs/alignment/paper_tables.log",
     benchmark:
@@ -49,13 +50,14 @@ rule alignment_paper_tables:
     localrule: True
     params:
         inputs=as_options,
+        note=lambda w: report_page.describe_differences(RUN, "alignment"),
         folder=subpath(output[0], parent=True),
         source=hash_code("alignment paper-tables"),
     message:
         "Comparing the paper's tables of scene 3 with ours"
     shell:
-        "psfdae paper alignment paper-tables {params.inputs:q} --out {params.folder}"
-        " > {log} 2>&1"
+        "psfdae paper alignment paper-tables {params.inputs:q} --note {params.note:q}"
+        " --page {output.page} --out {params.folder} > {log} 2>&1"
 
 
 rule alignment_time:
@@ -158,11 +160,13 @@ rule figure_alignment_correlation:
         f"{RESULTS}/benchmarks/alignment/figure_correlation.tsv"
     params:
         inputs=as_options,
+        note=lambda w: report_page.describe_differences(RUN, "alignment"),
         source=hash_code("alignment figure correlation"),
     message:
         "Drawing correlations of errors"
     shell:
-        "psfdae paper alignment figure correlation {params.inputs:q} --out {output} > {log} 2>&1"
+        "psfdae paper alignment figure correlation {params.inputs:q} --note {params.note:q}"
+        " --out {output} > {log} 2>&1"
 
 
 rule figure_alignment_stamps:

@@ -132,7 +132,7 @@ rule methods_table:
     params:
         source=hash_code("methods-table"),
         out=datasets.metric_options,
-        note=lambda w: "; ".join(report_page.group_warnings(RUN)),
+        note=lambda w: "; ".join(report_page.list_warnings(RUN)),
     message:
         "Writing the table of all methods"
     shell:

@@ -7,6 +7,7 @@ and tilt x, y of the secondary mirror, in units of their range.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -287,7 +288,7 @@ def _draw_twin_stamps(
 
 @apply_style
 def draw_correlations(
-    panels: Sequence[Sequence[tuple[str, np.ndarray]]], half_width: float
+    panels: Sequence[Sequence[tuple[str, np.ndarray]]], half_width: float, note: str = ""
 ) -> Figure:
     """Draw matrices of correlations; cells that are NaN stay empty.
 
@@ -297,6 +298,8 @@ def draw_correlations(
         The longest row fills the width of the figure.
     half_width : float
         Largest half of a 95 % interval of the measured correlations.
+    note : str
+        Below the title: how the run differs from the paper's.
     """
     short_labels = ("dx", "dy", "tx", "ty")
     # Rows of panels; those that a row does not fill stay empty.
@@ -318,5 +321,6 @@ def draw_correlations(
                     axes.text(b, a, f"{value:.2f}", ha="center", va="center", size=6.5, color=color)
     # One colour bar: all matrices have the range −1 … 1.
     figure.colorbar(images[-1], ax=all_axes, shrink=0.5, label="correlation of signed errors")
-    figure.suptitle(f"Measured correlations have 95 % intervals of at most ± {half_width:.2f}")
+    title = f"Measured correlations have 95 % intervals of at most ± {half_width:.2f}"
+    figure.suptitle(f"{title}\n{fill(note, 100)}".strip())
     return figure

@@ -220,22 +220,22 @@ def _pivot(
     return table.iloc[order].reset_index(drop=True)
 
 
-def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
-    """Return a table of `compare_errors` or `compare_correlations` as Markdown.
+def format_table(table: pd.DataFrame, digits: dict[str, str]) -> pd.DataFrame:
+    """Return a table of `compare_errors` or `compare_correlations` as texts.
 
     Parameters
     ----------
     table : DataFrame
         Four columns of keys, among them source and method, then numbers.
-    title : str
-        Line of text above the table.
     digits : dict
         Number format by the value of the column `quantity`; the key "" is for tables without it.
     """
     # Numbers as text; a value that was not measured or published is left empty.
-    text_table = table.copy()
+    text_table = table.astype(object).where(table.notna(), "")
+    keys = text_table.columns[:4]
+    text_table[keys] = text_table[keys].map(lambda k: f"{k:g}" if isinstance(k, float) else k)
     quantities = table.get("quantity", pd.Series("", index=table.index))
-    for column in table.columns[4:]:  # four columns of keys come first
+    for column in table.columns[4:]:
         text_table[column] = [
             "" if pd.isna(value) else format(value, digits[quantity])
             for value, quantity in zip(table[column], quantities, strict=True)
@@ -246,7 +246,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
         paper_labels[method] if source == "paper" else ESTIMATORS[method].look.label
         for method, source in zip(table["method"], table["source"], strict=True)
     ]
-    return f"{title}\n\n{text_table.to_markdown(index=False, disable_numparse=True)}\n"
+    return text_table
 
 
 def compute_fisher_interval(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,9 @@ from psfdae.methods import method
 from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation.measure import CELL
 from psfdae_paper.evaluation.paper import read_paper_names, read_published
+
+Note = Annotated[str, "How the run differs from the paper's; empty if it does not."]
+"""Option of commands that draw or tabulate errors beside the paper's."""
 
 PAGE_ROWS = 40
 """Rows that fit on a page; longer tables of LaTeX may break."""
@@ -108,7 +112,7 @@ def write_readable(path: Path, table: pd.DataFrame, title: str, note: str = "") 
     heading = f"{title}\n\n**{note}**" if note else title
     write_text(path.with_suffix(".md"), f"{heading}\n\n{markdown}\n")
     # LaTeX escapes the texts; signs that need mathematics follow.
-    caption = f"{title}. {note}".rstrip(". ").replace("_", r"\_").replace("%", r"\%")
+    caption = f"{title.rstrip('.')}. {note}".rstrip(". ").replace("_", r"\_").replace("%", r"\%")
     is_long = len(table) > PAGE_ROWS
     latex = table.to_latex(index=False, escape=True, caption=caption, longtable=is_long)
     for sign, command in LATEX_SIGNS.items():

@@ -17,7 +17,7 @@ import pandas as pd
 
 from psfdae.base.belonging import require, require_origin
 from psfdae.base.figures import write_png
-from psfdae.base.files import Product, ProductError, read_product, write_csv, write_text
+from psfdae.base.files import Product, ProductError, read_product, write_csv
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
@@ -35,8 +35,9 @@ from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.estimators import ESTIMATORS, Estimator, list_estimators
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation import alignment_figures, alignment_tables
+from psfdae_paper.evaluation import alignment_figures, alignment_tables, readable
 from psfdae_paper.evaluation.paper import read_published
+from psfdae_paper.evaluation.readable import Note
 from psfdae_paper.stages.alignment import StatesFile, read_states
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, draw_test_stamps
 
@@ -246,10 +247,13 @@ def tables(
 
 
 @command("paper alignment paper-tables")
-def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Folder) -> None:
+def alignment_paper_tables(
+    errors: ErrorTable, correlation: ErrorTable, out: Folder, page: File, note: Note = ""
+) -> None:
     """Compare measured errors with the paper's tables.
 
-    One table for each noise level of the paper, and one of correlations, as CSV and Markdown.
+    One table for each noise level of the paper, and one of correlations, as CSV, Markdown and
+    LaTeX, and all of them as a page for readers.
 
     Files are named alignment_paper_LEVEL and alignment_paper_correlation, with errors in units of
     the range. It is an error if a noise level of the paper was not measured.
@@ -261,18 +265,24 @@ def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Fol
     correlation : Path
         CSV of `alignment tables` with their correlations.
     out : Path
-        Folder for CSV and Markdown files.
+        Folder of the tables.
+    page : Path
+        HTML page with all tables.
+    note : str
+        How the run differs from the paper's.
     """
     test_sets = (
-        "Test set `grid`: the very states that the networks were trained on, with new noise; "
-        "`uniform`: other states of the same range."
+        "Test set grid: the very states that the networks were trained on, with new noise; "
+        "uniform: other states of the same range."
     )
+    texts = []
 
     def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
-        path = out / f"alignment_paper_{name}.csv"
+        path, title = out / f"alignment_paper_{name}.csv", f"{title}. {test_sets}"
         write_csv(path, table, digits=6)
-        text = alignment_tables.as_markdown(table, f"{title}. {test_sets}", digits)
-        write_text(path.with_suffix(".md"), text)
+        text_table = alignment_tables.format_table(table, digits)
+        readable.write_readable(path, text_table, title, note)
+        texts.append((title, text_table))
 
     # One table of errors for each of the paper's noise levels.
     error_table = read_table(errors)
@@ -286,6 +296,7 @@ def alignment_paper_tables(errors: ErrorTable, correlation: ErrorTable, out: Fol
     # Correlations of signed errors between pairs of parameters.
     table = alignment_tables.compare_correlations(read_table(correlation))
     write("correlation", table, "Correlations of signed errors", {"": ".3f"})
+    readable.write_page(page, texts, note)
 
 
 @command("paper alignment time-table")
@@ -496,7 +507,7 @@ def _trace_multiples(
 
 
 @command("paper alignment figure correlation")
-def figure_correlation(correlation: ErrorTable, out: Png) -> None:
+def figure_correlation(correlation: ErrorTable, out: Png, note: Note = "") -> None:
     """Draw measured and predicted correlations of errors, and the paper's.
 
     A panel is the matrix of the correlations between the four numbers of a state.
@@ -537,4 +548,4 @@ def figure_correlation(correlation: ErrorTable, out: Png) -> None:
     is_measured = table.method.isin([x.name for x in methods if x.name != "cramer_rao"])
     measured = table[is_measured & (table.parameter_a != table.parameter_b)]
     half_width = float((0.5 * (measured.ci_high - measured.ci_low)).max())
-    write_png(alignment_figures.draw_correlations(panels, half_width), out)
+    write_png(alignment_figures.draw_correlations(panels, half_width, note), out)

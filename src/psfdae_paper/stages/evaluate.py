@@ -32,6 +32,7 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation import comparison, readable
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import format_paper_table, paper_table
+from psfdae_paper.evaluation.readable import Note
 from psfdae_paper.stars.fields import square_grid
 
 READS = (
@@ -193,7 +194,6 @@ def estimators(
 
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
-Note = Annotated[str, "How the run differs from the paper's; empty if it does not."]
 Metric = Literal["mse", "ssim"]
 
 

@@ -26,7 +26,8 @@ from psfdae_paper.evaluation.drawing import reference_title
 from psfdae_paper.evaluation.figures import draw_energy, draw_templates, to_field_unit
 from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import read_published
-from psfdae_paper.stages.evaluate import Evaluations, Metric, Note
+from psfdae_paper.evaluation.readable import Note
+from psfdae_paper.stages.evaluate import Evaluations, Metric
 from psfdae_paper.stars.framing import cut_margin
 
 RestoredStars = Annotated[File, "Product of the stage evaluate: images of some stars."]

@@ -98,13 +98,14 @@ def describe_differences(run: Run, dataset: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def group_warnings(run: Run) -> dict[str, list[str]]:
-    """Return the datasets of a run by the line that says how they differ from the paper."""
+def list_warnings(run: Run) -> list[str]:
+    """Return lines that name datasets of a run and say how they differ from the paper."""
+    # Datasets with the same differences share a line.
     groups: dict[str, list[str]] = {}
     for dataset in (*list_default_datasets(run), SCENE3):
         if text := describe_differences(run, dataset):
             groups.setdefault(text, []).append("scene 3" if dataset == SCENE3 else dataset)
-    return groups
+    return [f"{', '.join(names)}: {text}" for text, names in groups.items()]
 
 
 def describe_training(run: Run, dataset: str) -> str:
