@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -81,14 +82,21 @@ def test_pixels_may_leave_the_range_of_the_training_by_half(stars, model, noise,
     assert robust_flux(batch, model).flags[3] == flags
 
 
-def test_one_fit_is_the_one_of_dense_matrices(stars, model):
-    """Flux, error, leave-one-out residuals and repaired pixels of the formulae over used pixels."""
+@pytest.mark.parametrize("modes", [256, 40])
+def test_one_fit_is_the_one_of_dense_matrices(stars, model, modes):
+    """Flux, error, leave-one-out residuals and repaired pixels of the formulae over used pixels.
+
+    Few modes leave out directions, which have one variance.
+    """
+    other = model.variance[-modes:].min() if modes < 256 else 0.0
+    leading = {"basis": model.basis[:, -modes:], "variance": model.variance[-modes:]}
+    model = replace(model, **leading, other_variance=other)
     rng = np.random.default_rng(1)
     x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
     used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
     prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
     results = module.solve_least_squares(x, used, prior, sigma, model)
-    covariance = (model.basis * model.variance) @ model.basis.T
+    covariance = (model.basis * (model.variance - other)) @ model.basis.T + other * np.eye(256)
     for star, (flux, error, score, repaired) in enumerate(zip(*results, strict=True)):
         total = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
         used_px, bad_px = np.flatnonzero(used[star]), np.flatnonzero(~used[star])

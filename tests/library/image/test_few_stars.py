@@ -103,6 +103,9 @@ def test_size_of_stars(fwhm, side):
     assert size.side(0.95) == side
     light_fraction = 1 - (1 + side**2 / np.pi / alpha**2) ** -2
     assert size.light_within(side) == pytest.approx(light_fraction, abs=0.012)
+    # A list may be off by a pixel: the profile is about the centre of the light.
+    off = measure_size(image - SKY, np.zeros(image.shape, bool), place + np.array([1.0, -1.0]))
+    assert off.fwhm_px == pytest.approx(size.fwhm_px, rel=0.02)
 
 
 def test_wide_stars_get_wide_stamps_unless_a_size_is_stated(wide_stars):
@@ -117,6 +120,9 @@ def test_wide_stars_get_wide_stamps_unless_a_size_is_stated(wide_stars):
     assert np.sqrt(np.square(off).mean(axis=0)) == pytest.approx(0.0, abs=0.1)
     stated = psfdae.Stars.from_image(image, catalogue=place, stamp_px=16, **CAMERA)
     assert stated.settings.framing.stamp_px == 16
+    # The finest structure of these stars is wider by a factor of two to four than is usual.
+    field, usual = stars.settings.field, stated.settings.field
+    assert (field.spacing_px, field.step_px) == (2 * usual.spacing_px, 2 * usual.step_px)
 
 
 def test_stated_size_is_taken_as_it_is():

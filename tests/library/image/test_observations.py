@@ -153,10 +153,28 @@ def test_the_scale_of_the_wcs_goes_before_a_nominal_one(tmp_path):
     stars = catalogue(tmp_path / "c.csv", [20], [15])
     observation = open_observation(path, D, catalogue=stars)
     assert observation.pixel_scale_arcsec == pytest.approx(0.7, rel=1e-9)
+    # A scale beyond any number is none.
+    with fits.open(path, mode="update") as (hdu, *_):
+        hdu.header.update({key: 1e200 for key in ("CDELT1", "CDELT2")})
+    assert open_observation(path, D, catalogue=stars).pixel_scale_arcsec == 1.0
     fits.setval(path, "CTYPE1", value="RA---TNX")
     damaged = open_observation(path, D, catalogue=stars)
     assert damaged.pixel_scale_arcsec == 1.0
     assert "its WCS (CTYPE1 = RA---TNX) is damaged and not used" in damaged.summary()
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((3, 300, 400), r"3 planes of 300×400 pixels, as of a colour image.*getdata\(…\)\[0\],"),
+        ((300, 400, 4), r"4 planes of 300×400 pixels.*getdata\(…\)\[\.\.\., 0\],"),
+    ],
+    ids=["first axis", "last axis"],
+)
+def test_planes_of_colours_are_refused_with_their_number_and_size(tmp_path, shape, words):
+    fits.writeto(tmp_path / "c.fits", np.zeros(shape, np.float32))
+    with pytest.raises(ObservationError, match=words):
+        open_observation(tmp_path / "c.fits", D)
 
 
 # Extensions and masks

@@ -25,7 +25,7 @@ from psfdae.image.sky_level import (
     sky_level,
     sky_steps,
 )
-from psfdae.image.star_criteria import sharper_than_stars, wider_than_stars
+from psfdae.image.star_criteria import find_pile_up, sharper_than_stars, wider_than_stars
 from psfdae.image.trails import add_trails, find_saturated_cores, find_spikes, find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.photometry import crowded
@@ -151,6 +151,17 @@ def test_an_image_that_was_cut_off_says_its_saturation(clean):
     assert "exactly the largest value, 3000 counts: taken as saturated" in observation.summary()
 
 
+@pytest.mark.parametrize("level", [60123.4567, 987.654321])
+def test_stars_that_are_cut_off_have_one_brightest_pixel(level):
+    """Rounded down to six digits, as it is printed; no level without stars that are cut off."""
+    brightness = np.append(np.geomspace(0.1, 0.9, 15), np.geomspace(1.1, 5.0, 15))
+    sky, peak = np.full(30, 0.1 * level), 0.9 * level * brightness
+    assert find_pile_up(sky + np.minimum(peak, 0.9 * level), sky, brightness) == float(
+        f"{level - 0.5 * 10 ** (np.floor(np.log10(level)) - 5):.6g}"
+    )
+    assert find_pile_up(sky + peak, sky, brightness) == np.inf
+
+
 # Areas that receive no light.
 
 
@@ -168,6 +179,18 @@ def illumination(kind):
         "strip": (row + 90, 3),
     }[kind]
     return 1.0 / (1.0 + np.exp(-np.clip(inside_px / softness_px, -50, 50)))
+
+
+@pytest.mark.parametrize(("squares", "is_area"), [(3, False), (5, True)])
+def test_a_dark_area_has_16_squares_of_8_px_or_more(squares, is_area):
+    rng = np.random.default_rng(4)
+    image, size = rng.normal(300.0, 10.0, (256, 256)), 8 * squares
+    image[64 : 64 + size, 96 : 96 + size] = rng.normal(100.0, 2.0, (size, size))
+    found = bad_pixels.find_dark_area(image, np.zeros(image.shape, bool))
+    assert (found is not None) == is_area
+    if found is not None:
+        assert found[0] == pytest.approx(100.0, abs=0.3)
+        assert size**2 <= found[1].sum() < 1.3 * size**2  # with its edge
 
 
 @pytest.mark.parametrize(
@@ -412,6 +435,23 @@ def test_stars_around_saturated_ones_are_no_spikes():
     image, clear = np.minimum(noisy(light, rng), 6e4), np.zeros(light.shape, bool)
     spikes = find_spikes(image, clear, sky_level(image, clear), image >= 6e4)
     assert find_saturated_cores(image >= 6e4)[3, 2] > 2 and spikes.mean() < 0.013
+
+
+@pytest.mark.parametrize("side", [200, 400])
+@pytest.mark.parametrize("length", [48, 80])
+def test_a_spike_ends_where_its_light_ends(side, length):
+    """In an image of any size, in spite of a gap of 8 px; the mask is 2 px wider than the light."""
+    row, column = np.indices((side, side)) - side // 2
+    is_lit = (column > 0) & (column < length) & ((column < 32) | (column >= 40))
+    image = np.random.default_rng(2).normal(100.0, 1.0, (side, side))
+    image += is_lit * 200.0 * np.exp(-0.5 * (row / 0.8) ** 2)
+    image[np.hypot(row, column) < 5] = 6e4
+    none = np.zeros(image.shape, bool)
+    mask = add_trails(image, bad_pixels.BadPixels(none, none, ()), 6e4).mask
+    rows, columns = np.nonzero(mask)
+    # Light of 200 σ is above noise within 3 px of the middle row, as means of 3 × 3 px see it.
+    assert (columns - side // 2).max() == length + 1 and mask[side // 2, side // 2 + 20 :].any()
+    assert np.ptp(rows) + 1 == pytest.approx(12, abs=1)
 
 
 # Bad pixels.

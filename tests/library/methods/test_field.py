@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import NDData
 from astropy.table import Table
+from numpy.testing import assert_allclose
 from packaging.version import Version
 from photutils.psf import GriddedPSFModel, PSFPhotometry
 
@@ -20,7 +21,9 @@ from image_training import few_draws
 from psfdae import load_model
 from psfdae.denoise.bundle import read_bundle, write_bundle
 from psfdae.denoise.star_model import StarModel
+from psfdae.image.selection import Candidates, Verdict
 from psfdae.methods.field import FieldMixture, select_fit_stars
+from psfdae.methods.field.fit import FieldFitter, FitOptions
 from psfdae.methods.field.nodes import node_step
 from psfdae.methods.field.posterior import log_node_prior
 from psfdae.methods.field.prior import FieldPrior, PosteriorLimits
@@ -30,6 +33,7 @@ from psfdae.psf.interface import PredictionError
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import measure_shapes
 from psfdae.stars.noise import NoiseModel
+from psfdae.training.star_residuals import reject_misfits
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -171,6 +175,18 @@ def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     )
     flux_and_sky = measured.covariance[:, 0, 1] / (error[:, 0] * error[:, 1])
     assert np.corrcoef(off[:, 0], off[:, 1])[0, 1] == pytest.approx(flux_and_sky.mean(), abs=0.12)
+
+
+def test_the_form_of_free_flux_measures_what_the_other_form_knows(field):
+    """Flux and sky of images at high S/N; without it, images have flux 1 and no sky."""
+    faint, scale = Faint(50, 50.0), np.random.default_rng(2).uniform(0.7, 1.4, 50)
+    images = scale[:, None, None] * faint.psf + 0.01
+    free = field.free_flux().estimate(images, 1e-4, faint.position).measurements
+    assert free.flux == pytest.approx(scale, rel=0.05)
+    assert free.background == pytest.approx(0.01, abs=1e-3)
+    known = field.estimate(faint.psf, 1e-4, faint.position).measurements
+    assert known.flux == pytest.approx(1.0, abs=0.003)
+    assert known.background == pytest.approx(0.0, abs=1e-4)
 
 
 def test_known_place_is_better_than_a_list_and_a_list_better_than_nothing(field):
@@ -514,6 +530,14 @@ def test_python_takes_positions_and_centres(image):
     assert blind.flags[0] & 8 and np.isnan(blind.psf).all() and np.isnan(blind.x_fit).all()
 
 
+def test_fluxes_and_their_errors_have_the_unit_of_the_stamps(image):
+    model, faint = load_model(image[1]), Faint(50, 20.0)
+    one, other = (model.predict(unit * faint.stamps, position=faint.position) for unit in (1, 50))
+    for name in ("flux", "flux_error", "background", "noise"):
+        assert getattr(other, name) == pytest.approx(50 * getattr(one, name), rel=1e-3), name
+    assert other.x_error == pytest.approx(one.x_error, rel=1e-3)
+
+
 def test_bad_pixels_are_left_out(image):
     model, faint = load_model(image[1]), Faint(100, 50.0)
     spoilt = faint.stamps.copy()
@@ -613,3 +637,67 @@ def test_sigma_knows_the_doubt_about_the_flux(field, snr):
     bright = result.psf >= np.sort(result.psf.reshape(500, -1))[:, -9, None, None]
     for width, part in ((1.0, 0.683), (1.96, 0.95)):
         assert (error <= width * sigma)[bright].mean() == pytest.approx(part, abs=0.04)
+
+
+# Numbers of the fit
+
+
+def test_a_change_between_exposures_is_a_fraction_of_the_coefficient(stars, field, monkeypatch):
+    """The ridge ρ = 1/(change |c| + min)²: a change by that fraction is one standard deviation."""
+    ridges = []
+
+    def solve(terms, data, weight, splines, penalty, ridge, start, tolerance):
+        ridges.append(ridge)
+        return np.zeros(ridge.shape)
+
+    monkeypatch.setattr("psfdae.methods.field.fit.solve_splines", solve)
+    prior = field.model
+    fitter = replace(FieldFitter.build(stars, 1e6, FRAME, SIDE), prior=prior)
+    terms, settings = prior.terms(stars.place), fitter.settings
+    options = FitOptions(knots=prior.coefficients.shape[1], smoothness=0.0, order=2, change=0.1)
+    weight = np.full(fitter.images.shape, 1e6)
+    coefficients = fitter.fit_splines(
+        options, terms, fitter.images, weight, stars.centre, prior.coefficients
+    )
+    sigma = 0.1 * np.abs(coefficients[0]) + settings.min_coefficient
+    assert np.ptp(np.log10(sigma)) > 2
+    assert_allclose(ridges[0][0] * sigma**2, 1.0, rtol=1e-9)
+    assert_allclose(ridges[0][1:] * sigma**2, settings.varying_change**-2, rtol=1e-9)
+
+
+def test_a_blend_changes_nothing_in_the_field(field):
+    stars = bright(60)
+    stamps = stars.stamps.copy()
+    stamps[3] += 0.5 * np.roll(stamps[3], 3, axis=1)
+    others = stars.select(np.delete(np.arange(60), 3))
+    options = FitOptions(knots=field.model.coefficients.shape[1], smoothness=100.0, order=1)
+    with_blend, without = (
+        FieldFitter.build(part, 1e6, FRAME, SIDE).fit(options)
+        for part in (replace(stars, stamps=stamps), others)
+    )
+    assert not with_blend.good[3] and with_blend.good.sum() > 50
+    coefficients = without.model.coefficients
+    limit = 0.01 * np.abs(coefficients).max()
+    assert_allclose(with_blend.model.coefficients, coefficients, rtol=0.0, atol=limit)
+
+
+@pytest.mark.parametrize(("depth", "is_misfit"), [(0.015, False), (0.03, True)])
+def test_a_star_is_a_misfit_if_its_pixels_are_2_per_cent_off(depth, is_misfit):
+    """Pixels wrong by ±ε of their light have d² = Σ p (ε p)² / Σ p³ = ε²."""
+    stars = bright(40, varied=False, spread=0.0)
+    noise = np.full(40, 1e-6)
+    clean = truth(np.full((40, 2), FIELD / 2), stars.listed, FRAME)
+    pattern = 1 + depth * (-1.0) ** np.indices((FRAME, FRAME)).sum(axis=0)
+    clean[7] *= pattern
+    stars = replace(stars, stamps=clean, noise=noise, snr=1 / noise, centre=stars.listed)
+    zeros, verdict = np.zeros(40), np.full(40, Verdict.GOOD, object)
+    candidates = Candidates(
+        np.arange(40), stars.position, stars.snr, noise, zeros, zeros, zeros, verdict, stars
+    )
+    settings = SimpleNamespace(
+        seed=0,
+        framing=SimpleNamespace(stamp_px=SIDE),
+        noise=SimpleNamespace(background_photons=1e6),
+    )
+    checked = reject_misfits(candidates, settings, None)
+    assert np.flatnonzero(checked.verdict == Verdict.MISFIT).tolist() == [7] * is_misfit

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,10 +27,18 @@ from psfdae.image.opening import open_observation
 from psfdae.image.stamps import cut_image
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
+from psfdae.photometry.image_photometry import add_unmeasured_rows
 from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
-from psfdae.photometry.wings_fit import StarFluxes, draw_tents, fit_wings
+from psfdae.photometry.wings_fit import (
+    StarFluxes,
+    draw_tents,
+    draw_wings,
+    fit_wings,
+    measure_halo,
+)
 from psfdae.psf.grid import PsfGrid
-from psfdae.psf.wings import Wings, compute_prior_profile
+from psfdae.psf.wings import Wings, compute_prior_profile, outer_shares
+from psfdae.training import neighbours
 from psfdae.training.neighbours import draw_other_stars
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -223,6 +232,33 @@ def test_the_light_of_wings_is_the_sum_over_pixels():
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
 
 
+@pytest.mark.parametrize("name", ["place", "flux", "outer_share"])
+def test_stars_of_which_something_is_unknown_have_no_wings(name):
+    wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
+    stars = StarFluxes(np.array([[40.3, 40.1], [20.0, 30.0]]), np.ones(2), np.ones(2))
+    first = StarFluxes(*(values[:1] for values in stars))
+    getattr(stars, name)[1] = np.nan
+    light = draw_wings((81, 81), stars, wings)
+    assert light.max() > 0 and np.array_equal(light, draw_wings((81, 81), first, wings))
+
+
+def test_the_outer_share_is_the_light_from_07_to_1_times_half_a_stamp():
+    """Of stars in any number, each by its own PSF; NaN where a position is not known."""
+    place = np.column_stack([np.arange(1.0, 3002.0), np.full(3001, 5.0)])
+    place[[0, 2100], [1, 0]] = np.nan
+    side = 20
+    y, x = np.indices((side, side)) - side // 2
+
+    def draw(position):
+        assert len(position) <= 2048
+        return np.full((len(position), side, side), 0.001) * position[:, :1, None]
+
+    radius = np.hypot(x, y)
+    pixels = np.count_nonzero((radius >= 0.7 * side / 2) & (radius < side / 2))
+    expected = np.where(np.isnan(place).any(axis=1), np.nan, 0.001 * pixels * place[:, 0])
+    np.testing.assert_allclose(outer_shares(draw, place), expected, rtol=1e-9)
+
+
 def test_wings_are_round_up_to_their_end():
     wings = Wings(RADIUS, np.full(len(RADIUS), 1e-4), np.eye(len(RADIUS)), 1.0)
     star = StarFluxes(np.array([[40.0, 40.0]]), np.ones(1), np.ones(1))
@@ -383,6 +419,23 @@ def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighb
         assert abs(np.median(phot.residual[ring])) < 0.1 * np.median(halo[ring])
 
 
+def test_a_halo_is_the_median_of_rings_and_goes_on_as_a_power_of_the_distance():
+    """A halo r^-3 above noise out to 60 px, off the middle of its core; nothing from 256 px on."""
+    y, x = np.indices((600, 600), dtype=float)
+    radius = np.maximum(np.hypot(x - 300.3, y - 299.6), 1.0)
+    truth = 1e6 * radius**-3.0
+    image = truth + np.random.default_rng(5).normal(0.0, 1.0, truth.shape)
+    none = np.zeros(image.shape, bool)
+    halo = measure_halo(image, none, np.ones(image.shape), np.array([300.0, 300.0, 8.0]))
+    light = np.zeros(image.shape)
+    light[halo.window] = halo.light
+    ratio = light / truth
+    for near, far, tolerance in ((10, 50, 0.03), (80, 250, 0.5)):
+        ring = ratio[(radius > near) & (radius < far)]
+        assert np.median(ring) == pytest.approx(1.0, abs=tolerance)
+    assert (light[radius > 257] == 0).all() and (light[radius < 255] > 0).all()
+
+
 @pytest.mark.parametrize(
     ("light", "middle", "stretch"),
     [(2e7, (100.4, 119.6), 1.0), (2e8, (185.3, 289.6), 1.0), (2e8, (60.0, 60.0), 1.08)],
@@ -436,6 +489,20 @@ def test_what_cannot_be_measured_is_refused_in_one_line(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["far.csv", "near.csv"]
 
 
+def test_rows_that_cannot_be_measured_are_nan_and_flagged_among_the_others():
+    measured = Table({"id": [1, 2], "x": [1.5, 2.5], "y": [1.0, 2.0], "flux": [10.0, 20.0]})
+    measured["flags"], measured["group"] = np.array([0, 4], np.uint16), [1, 2]
+    place = np.array([[1.0, 1.0], [np.nan, 7.0], [2.0, 2.0]])
+    flags = np.array([0, 0, 32], np.uint16)
+    observation = SimpleNamespace(positions=place, stars=SimpleNamespace(id=[5, 6, 7], flags=flags))
+    rows = add_unmeasured_rows(measured, observation, np.array([False, True, False]))
+    assert rows["id"].tolist() == [5, 6, 7] and rows["flags"].tolist() == [0, 8, 36]
+    np.testing.assert_array_equal(rows["x"], [1.5, np.nan, 2.5])
+    np.testing.assert_array_equal(rows["y"], [1.0, 7.0, 2.0])
+    np.testing.assert_array_equal(rows["flux"], [10.0, np.nan, 20.0])
+    assert rows["group"].tolist() == [1, 0, 2]
+
+
 def test_light_of_others_leaves_each_star_alone(sky, phot):
     """Stars of pairs, without what their neighbours add: within the noise and 3 % of their peak."""
     folder, _, true = sky
@@ -477,6 +544,25 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
         assert ratio[part].std() == pytest.approx(0.011, abs=0.003)
     means = [images[part].mean(axis=0) for part in (single, ~single)]
     assert np.abs(means[0] - means[1]).max() < 0.01 * means[0].max()
+
+
+def test_the_second_choice_of_stars_has_the_given_limit_on_neighbours(sky, monkeypatch):
+    """Stars that were accepted in spite of brighter neighbours are measured twice."""
+    stars, limits = stars_of(sky), []
+    accepted = stars.settings.calibration_stars.model_copy(update={"neighbour_ratio": 0.5})
+    settings = stars.settings.model_copy(update={"calibration_stars": accepted})
+
+    def collect(observation, calibration, framing, isolation_px):
+        limits.append(calibration.neighbour_ratio)
+        return stars.candidates
+
+    nothing = SimpleNamespace(stars=[])
+    monkeypatch.setattr(crowded, "photometry", lambda *_: nothing)
+    monkeypatch.setattr(neighbours, "draw_other_stars", lambda *_: None)
+    monkeypatch.setattr(neighbours, "collect", collect)
+    chosen = neighbours.subtract_neighbours(replace(stars, settings=settings), 0.05)
+    assert limits == [0.05, 0.05]
+    assert chosen.settings.calibration_stars.neighbour_ratio == 0.05
 
 
 def test_of_two_stars_that_move_to_one_place_one_is_kept():

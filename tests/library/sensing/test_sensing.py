@@ -21,7 +21,7 @@ from psfdae.optics.wavefronts import zernike_images
 from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson_information
-from psfdae.sensing.joint import twin_numbers
+from psfdae.sensing.joint import TelescopePosterior, twin_numbers
 from psfdae.sensing.plot import bright_separate_stars
 from psfdae.sensing.results import build_stamps
 from psfdae.sensing.sampling import Chains, sample_around
@@ -247,6 +247,11 @@ def test_noise_free_stars_come_back():
     assert measured["flux"] == pytest.approx(flux, rel=5e-3)
     assert measured["sky"] == pytest.approx(SKY, abs=5 * measured["sky_error"].max())
     assert wavefronts.explained.all()
+    # Candidates of a search are draws from the prior, of mean 0 and variance 1.
+    starts = wavefronts.search._match_candidates(0, 1, 400, 400)
+    candidates = starts[:, : truth.shape[1]]
+    assert len(candidates) == 400 and candidates.mean(axis=0) == pytest.approx(0.0, abs=0.2)
+    assert candidates.std(axis=0) == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.slow
@@ -337,6 +342,27 @@ def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     assert state.correlation == pytest.approx(state.correlation.T)
 
 
+def test_the_posterior_of_a_telescope_is_likelihood_times_normal_prior():
+    """Height, slope and information of the stars' counts, and of numbers N(0, 1) once for all."""
+    telescope, rng = three_terms(), np.random.default_rng(6)
+    angle = field_of(telescope, 3, rng)
+    model = model_telescope(telescope, angle)
+    counts, _ = imaged(
+        telescope, angle, model.coefficients(model.mean), np.zeros((3, 2)), 60.0, rng
+    )
+    search = sensed(counts, telescope, angle).search
+    posterior = TelescopePosterior(search, model, np.arange(3), search.optics)
+    t = rng.standard_normal(posterior.number_count)
+    values = np.append(t, np.tile([0.1, -0.2, 0.9, 0.0], 3))
+    deviance, star_score, star_information = posterior.evaluate_stars(values)
+    (height,), (score,), (information,) = posterior.evaluate(np.arange(1), values[None])
+    assert height == pytest.approx(-0.5 * (deviance.sum() + t @ t), rel=1e-9)
+    q = t.size
+    assert score[:q] == pytest.approx(star_score[:, :q].sum(axis=0) - t, rel=1e-9)
+    expected = star_information[:, :q, :q].sum(axis=0) + np.eye(q)
+    assert information[:q, :q] == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.mark.usefixtures("short_chains")
 def test_seeing_is_found_with_the_telescope():
     """Worse by 20 % than the file says; its error goes with that of the aberrations."""
@@ -359,6 +385,26 @@ def test_seeing_is_found_with_the_telescope():
     pull = (state.value[:-1] - truth) / state.error[:-1]
     assert np.sqrt(np.mean(pull**2)) < 2.0
     assert np.abs(state.correlation[-1, :-1]).max() > 0.2
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "units"),
+    [
+        ("newtonian", ["defocus", "axis_x", "axis_y"], ["m", "deg", "deg"]),
+        ("zernike", ["z4.constant", "z6.xx"], ["wave", "wave"]),
+    ],
+)
+def test_numbers_of_a_telescope_have_names_and_units(kind, names, units):
+    """Of its aberrations, and of the seeing where the prior leaves it free."""
+    seeing = {"seeing": Seeing(kind="gaussian", fwhm_arcsec=1.5)}
+    telescope = example(kind)
+    prior = telescope.prior.model_copy(update={"seeing": 0.1})
+    telescope = telescope.model_copy(update={**seeing, "prior": prior})
+    model = model_telescope(telescope, np.zeros((2, 2)))
+    unit_of = dict(zip(model.names, model.units, strict=True))
+    assert [unit_of[name] for name in names] == units
+    assert (model.names[-1], model.units[-1]) == ("seeing", "arcsec")
+    assert (model.mean[-1], model.sd[-1]) == pytest.approx((1.5, 0.15))
 
 
 def test_slopes_of_the_field_s_numbers_are_differences():
