@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel
 
     from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
+    from psfdae.image.containers import ImageLike
 
 
 class StarKeywords(ImageKeywords, total=False):
@@ -88,7 +88,7 @@ class Stars(ImageStars):
     @check_arguments
     def from_image(
         cls,
-        image: Image | Sequence[Image],
+        image: ImageLike | Sequence[ImageLike],
         catalogue: StarList | None = None,
         **options: Unpack[StarKeywords],
     ) -> Self:
@@ -144,7 +144,7 @@ class PsfModel(StarModel):
     @check_arguments
     def predict_image(
         self,
-        image: Image,
+        image: ImageLike,
         catalogue: StarList | None = None,
         *,
         fixed: bool = False,
@@ -183,7 +183,7 @@ class PsfModel(StarModel):
     @check_arguments
     def adapt(
         self,
-        image: Image,
+        image: ImageLike,
         catalogue: StarList | None = None,
         *,
         name: str | None = None,
@@ -216,7 +216,7 @@ class PsfModel(StarModel):
     @check_arguments
     def photometry(
         self,
-        image: Image,
+        image: ImageLike,
         catalogue: StarList | None = None,
         *,
         zero_point: float | None = None,
@@ -259,7 +259,7 @@ class PsfModel(StarModel):
 
     @check_arguments
     def residual(
-        self, image: Image, catalogue: StarList | None = None, **options: Unpack[ImageKeywords]
+        self, image: ImageLike, catalogue: StarList | None = None, **options: Unpack[ImageKeywords]
     ) -> CCDData:
         """Return an image without its sky and stars, which are measured as by `photometry`.
 

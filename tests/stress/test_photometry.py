@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from psfdae.denoise.flux_model import FluxModel, robust_flux
-from psfdae.image.stamps import StarFlag, border_median
+from psfdae.image.sky import border_median
+from psfdae.image.stamps import StarFlag
 
 pytestmark = pytest.mark.slow
 SIGMAS = 4.0  # sampling errors that a measured RMS may be off by

@@ -24,6 +24,7 @@ from psfdae.denoise.image_prediction import notes_on_model, offsets_from_list, o
 from psfdae.denoise.prediction import prediction_file
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.fits_file import Card
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
@@ -246,4 +247,4 @@ def write_prediction(
             offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
             star_index += len(prediction)
         note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
-    return flag_counts, unflagged_count, note if observation.shape else None
+    return flag_counts, unflagged_count, note if isinstance(observation, Image) else None

@@ -20,6 +20,7 @@ from psfdae.commands.predict import check_targets, write_list
 from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.catalogue import StarList, as_catalogue
 from psfdae.image.detector_frame import find_offset
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
@@ -120,7 +121,7 @@ def _list_note(wavefronts: Wavefronts, observation: Observation) -> list[str]:
     list of str
         Empty for stamps without an image, and if stars are where the list says.
     """
-    if observation.shape is None or observation.positions is None:
+    if not isinstance(observation, Image):
         return []
     # Centroid of the light of the fitted star, in pixels of its stamp (Σ x I / Σ I); the chief
     # ray, about which PSFs are centred, is elsewhere if there is coma.
@@ -212,7 +213,7 @@ def field_angles(
             return angle
     # Else positions, counted from the axis.
     positions, shape = observation.positions, observation.shape
-    if axis is None and shape is not None:
+    if axis is None and isinstance(observation, Image):
         axis = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
     if positions is None or axis is None:
         raise SensingError(

@@ -24,11 +24,10 @@ from psfdae.denoise.error_model import ErrorModel, mahalanobis
 from psfdae.denoise.flux_model import NOISE_FLOOR, FluxModel, Photometry, is_faint
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.star_flux import Photometer
+from psfdae.image.sky import border_median, border_scatter
 from psfdae.image.stamps import (
     Stamps,
     StarFlag,
-    border_median,
-    border_scatter,
     cut,
     displacement,
     raise_flag,

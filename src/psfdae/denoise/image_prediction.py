@@ -14,6 +14,7 @@ from psfdae.base.errors import call, keyword
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.camera import other_instruments
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
@@ -56,7 +57,7 @@ def predict_stars(
         offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
     # The stars are near the listed positions, or the list is refused.
     offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
-    notes = [observation.summary(), offset_note if observation.shape else None]
+    notes = [observation.summary(), offset_note if isinstance(observation, Image) else None]
     prediction = Prediction.joined(predictions)
     unlike_count = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
     notes += notes_on_model(model, observation, unlike_count)
@@ -79,7 +80,7 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
     statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} states it)"
     scale_note = statement if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{scale_note}")
-    if fixed and not (model.method.knows_field and observation.shape):
+    if fixed and not (model.method.knows_field and isinstance(observation, Image)):
         raise PredictionError(
             f"{source.path}: {call('fixed=True', '--fixed-positions')} takes an image with a star "
             f"list, and a model of the method field"
@@ -101,7 +102,7 @@ def notes_on_model(model: StarModel, observation: Observation, unlike_count: int
     if unlike_count >= max(3, 0.1 * observation.count):
         misfit = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
         notes.append(f"{observation.path}: {misfit}: {CAUSES}")
-    if observation.shape and model.method.knows_field and not model.wings:
+    if isinstance(observation, Image) and model.method.knows_field and not model.wings:
         notes.append(
             "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
             f"{model.stamp_px} px; flux is the light in the stamp"

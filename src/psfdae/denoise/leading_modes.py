@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.denoise.flux_model import NOISE_FLOOR, FluxModel
-from psfdae.image.stamps import border_pixels
+from psfdae.image.sky import border_pixels
 from psfdae.stars.moments import SIGMA_OF_MAD
 
 

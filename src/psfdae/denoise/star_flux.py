@@ -54,7 +54,7 @@ class Photometer:
         bad : ndarray of bool, shape (n, d, d)
             Pixels that are not used.
         start : ndarray, shape (n,)
-            Sky to start from (`psfdae.image.stamps.border_median`).
+            Sky to start from (`psfdae.image.sky.border_median`).
         given_stars : Stamps
             Its `flux`, `background` and `noise` are taken where they are not NaN.
         """

@@ -27,6 +27,7 @@ from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.stamp_arrays import make_stamps
 from psfdae.image.detector_frame import find_offset
+from psfdae.image.image import Image
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps
 from psfdae.image.tables import html_table
@@ -313,7 +314,7 @@ class StarModel(FieldPsfs):
     def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
         """Return the model in the pixel frame of an image, and notes on how frames differ."""
         size = self.image_px
-        if not self.method.knows_field or size is None or observation.shape is None:
+        if not self.method.knows_field or size is None or not isinstance(observation, Image):
             return self, []
         # Frames of both images; models of older releases do not have one.
         sizes = np.array(observation.shape[::-1]), np.array(size)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +17,7 @@ from psfdae.base.errors import keyword, warn
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, card_value, open_pixels
 from psfdae.image.header_units import count_powers, parse_number, parse_unit
-from psfdae.image.sky_level import noise_correlation
-from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
+from psfdae.image.sky import SkySample, sample_sky
 
 LARGEST_STAMP_PX = 256
 """Side of the largest stamps; planes of a cube that are larger are images."""
@@ -53,35 +51,6 @@ class CameraValue(NamedTuple):
 
     value: float | None
     origin: str
-
-    def times(self, factor: float) -> CameraValue:
-        """Return the number in a unit that is smaller by a factor."""
-        return self if self.value is None else self._replace(value=self.value * factor)
-
-
-@dataclass(frozen=True)
-class SkySample:
-    """Sky of an image from squares spread over it, in the image's unit.
-
-    Attributes
-    ----------
-    level, noise : float
-        Median over the squares of their median and of their scatter, σ by the median deviation
-        and, where pixels share their noise, the scatter of sums of pixels.
-    highest : float
-        Largest pixel of all squares.
-    correlation : float
-        Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
-    checker : float
-        Level of the pixels of even rows and columns and of odd ones, less the level of the others,
-        in units of the noise: the contrast of a chessboard.
-    """
-
-    level: float
-    noise: float
-    highest: float
-    correlation: float
-    checker: float
 
 
 ONE_COLOUR = (
@@ -204,59 +173,6 @@ def find_gain(image: ImageFile) -> CameraValue:
     return gain
 
 
-def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
-    """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
-
-    Squares of one value, such as an area without data, are ignored.
-
-    Parameters
-    ----------
-    image : ImageFile
-        Image (h, w) whose pixels are read.
-    square_px : int
-        Side of the squares in which sky and noise are measured.
-    """
-    rows, columns = image.shape
-    # Bands of rows, evenly spread over the image.
-    last_row = max(rows - square_px, 0)
-    count = min(32, -(-rows // square_px))
-    starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
-    levels, noises, highest = [], [], -np.inf
-    # Deviations from the sky in σ, band below band, with four rows without values between them.
-    deviations = np.full((len(starts), square_px + 4, columns), np.nan)
-    with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
-        for start, deviation in zip(starts, deviations, strict=True):
-            band = pixels[start : start + square_px]
-            band = np.where(np.isfinite(band), band, np.nan)
-            highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
-            # Medians of whole counts become the medians of the counts before rounding.
-            band, dither_variance = dither(band, count_step(band))
-            for column in range(0, columns, square_px):
-                square = band[:, column : column + square_px]
-                values = square[np.isfinite(square)]
-                if values.size < square_px:
-                    continue
-                # Stars in a square hardly change its median and its median deviation.
-                level = float(np.median(values))
-                noise = float(remove_dither(robust_scatter(values), dither_variance))
-                if noise > 0:
-                    deviation[: len(band), column : column + square_px] = (square - level) / noise
-                    levels.append(level)
-                    noises.append(noise)
-    if not levels:
-        return None
-    # Bands begin at even rows. Stars are clipped at 3 σ; medians would be equal for most whole
-    # counts.
-    bands = deviations.reshape(-1, columns)
-    is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
-    white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
-    checker = float(np.nanmean(white) - np.nanmean(black))
-    # Resampled pixels share noise: sums of them scatter by more than independent ones.
-    correlation = noise_correlation(bands)
-    noise = correlation * float(np.median(noises))
-    return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
-
-
 def find_clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
     """Find the largest value of an image, and its pixels, if the image is clipped there.
 
@@ -315,7 +231,7 @@ def check_camera(
     remarks : list of str
         A sentence on each value that does not, on colours, and on noise that pixels share.
     correlation : float
-        Noise of sums of pixels over the noise of sums of independent pixels, at least 1.
+        Ratio of the noise of sums of pixels to the noise of sums of independent ones, at least 1.
 
     Raises
     ------
@@ -353,8 +269,8 @@ def check_camera(
         f"{keyword('gain')} states another one"
     )
     # On a scale on which the gain does not apply, the saturation of the camera does not, either.
-    level, origin = values["saturation"]
-    if level is not None and origin != "given" and sky.highest <= 1.0 < level:
+    limit, origin = values["saturation"]
+    if limit is not None and origin != "given" and sky.highest <= 1.0 < limit:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
     return values, remarks, sky.correlation
 
@@ -380,11 +296,11 @@ def check_saturation(
     ObservationError
         If a given saturation is below the sky.
     """
-    unit, (level, origin) = image.unit or "counts", saturation
+    unit, (limit, origin) = image.unit or "counts", saturation
     remarks = []
     # A pixel of the sky cannot be saturated.
-    if level is not None and level <= sky.level:
-        problem = f"saturation at {level:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
+    if limit is not None and limit <= sky.level:
+        problem = f"saturation at {limit:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
         if origin == "given":
             problem += f"; {keyword('saturate')} takes the saturation of a pixel"
             raise ObservationError(image.path, problem)

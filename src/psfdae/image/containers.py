@@ -1,6 +1,6 @@
 """Images as Python hands them over: HDU, HDUList, CCDData, NDData, masked arrays, quantities.
 
-Each becomes a FITS file in a temporary place, with its mask as extension DQ and its uncertainty as
+Each becomes a temporary FITS file, with its mask as extension DQ and its uncertainty as
 ERR (σ), so that it is read as a file is. Plain arrays stay arrays.
 """
 
@@ -18,7 +18,7 @@ from psfdae.base.types import HDUList, Header, ImageHDU, NDData, PrimaryHDU, Qua
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import PlainFile, write_temporary
 
-Image: TypeAlias = str | Path | np.ndarray | NDData | HDUList | PrimaryHDU | ImageHDU
+ImageLike: TypeAlias = str | Path | np.ndarray | NDData | HDUList | PrimaryHDU | ImageHDU
 """Image as the public calls take it; see `as_image`."""
 
 

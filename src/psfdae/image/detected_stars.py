@@ -8,14 +8,14 @@ import numpy as np
 
 from psfdae.base.arguments import check_arguments
 from psfdae.base.types import QTable
-from psfdae.image.containers import Image
+from psfdae.image.containers import ImageLike
 from psfdae.image.image_input import ImageInput, PixelKeywords
 from psfdae.image.opening import open_observation
 from psfdae.image.tables import star_table
 
 
 @check_arguments
-def detect(image: Image, threshold: float = 5.0, **options: Unpack[PixelKeywords]) -> QTable:
+def detect(image: ImageLike, threshold: float = 5.0, **options: Unpack[PixelKeywords]) -> QTable:
     """Find the stars of an image.
 
     Parameters

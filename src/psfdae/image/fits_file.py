@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from psfdae.base.errors import require_file
 from psfdae.base.files import find_left_over, temporary_name
@@ -211,7 +210,7 @@ def open_hdus(file: PlainFile, as_stored: bool = False, **options: Any) -> HDULi
     file : PlainFile
         File, not compressed as a whole.
     as_stored : bool
-        Leave pixels as they are stored, for `ImageFile.physical`: neither scaled nor with blank
+        Leave pixels as they are stored, for `ImageFile`: neither scaled nor with blank
         pixels as NaN.
     **options
         Options of `astropy.io.fits.open`.
@@ -245,7 +244,7 @@ def check_counts(path: Path) -> None:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """One image of a FITS file, described but not read.
+    """One image of a FITS file, of which `open_pixels` makes the values readable by index.
 
     Attributes
     ----------
@@ -263,8 +262,11 @@ class ImageFile:
         Its own, then the primary one if it is another; none for an array.
     wcs : WCS or None
         Celestial WCS.
-    values : ndarray or None
-        Pixels of an image that is an array and in no file (`array_image`).
+    raw : array-like or None
+        Pixels as stored: an array that is in no file (`array_image`), or, of an open file, a
+        section that is read where it is indexed.
+    dtype : dtype
+        Type of the values.
     unit_factor : float
         Factor from the file's unit to the unit of the pixels that are read (`to_noise_unit`).
     """
@@ -278,7 +280,8 @@ class ImageFile:
     blank: int | None = None
     headers: tuple[Header, ...] = ()
     wcs: WCS | None = None
-    values: np.ndarray | None = None
+    raw: Any = None
+    dtype: type[np.floating] = np.float32
     unit_factor: float = 1.0
 
     @property
@@ -301,25 +304,26 @@ class ImageFile:
         """Return the value of a card of its own header; None if absent or not parseable."""
         return card_value(self.headers[0], key) if self.headers else None
 
-    def physical(self, raw: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
-        """Return physical values of raw ones, in native byte order, same shape.
-
-        Parameters
-        ----------
-        raw : ndarray
-            Pixels as the file has them: neither scaled nor with blank pixels as NaN.
-        dtype : dtype
-            Type of the values.
-        """
-        # value = bscale · raw + bzero, in double precision; without a scale, values are
-        # converted once.
-        if self.bscale == 1.0 and self.bzero == 0.0:
-            values = raw.astype(dtype)
-        else:
-            values = (raw.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
-        if self.blank is not None and raw.dtype.kind in "iu":
-            values[raw == self.blank] = np.nan
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Return physical values of an open image, in native byte order."""
+        key = key if isinstance(key, tuple) else (key,)
+        with reading(self.path):
+            # Index 0 along each leading axis; values as stored are neither scaled nor NaN if blank.
+            raw = np.asarray(self.raw[(0,) * self.leading + key])
+            # value = bscale · raw + bzero, in double precision; without a scale, values are
+            # converted once.
+            if self.bscale == 1.0 and self.bzero == 0.0:
+                values = raw.astype(self.dtype)
+            else:
+                values = (raw.astype(np.float64) * self.bscale + self.bzero).astype(self.dtype)
+            if self.blank is not None and raw.dtype.kind in "iu":
+                values[raw == self.blank] = np.nan
         return values
+
+    def read(self, dtype: type[np.floating] = np.float32) -> np.ndarray:
+        """Return the values of all pixels."""
+        with open_pixels(self, in_pieces=False, dtype=dtype) as pixels:
+            return pixels[:]
 
     def times(self, factor: float) -> ImageFile:
         """Return the image with all pixels times a factor."""
@@ -336,7 +340,7 @@ class ImageFile:
         # Rows, spread evenly over the image.
         rows = np.unique(np.linspace(0, self.shape[0] - 1, 32).astype(int))
         with open_pixels(self, in_pieces=True, dtype=np.float64) as pixels:
-            values = np.concatenate([pixels[slice(row, row + 1)].ravel() for row in rows])
+            values = np.concatenate([pixels[row : row + 1].ravel() for row in rows])
         values = values[np.isfinite(values)]
         deviation = np.abs(values - np.median(values)) if values.size else np.zeros(1)
         scatter = float(np.median(deviation)) or float(deviation.max())
@@ -397,7 +401,7 @@ def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
         raise ObservationError(
             path, f"{values.dtype} of shape {shape}, expected numbers of 2 or 3 dimensions"
         )
-    return ImageFile(PlainFile(path, path), 0, values.shape, values=values)
+    return ImageFile(PlainFile(path, path), 0, values.shape, raw=values)
 
 
 def find_image(
@@ -650,37 +654,11 @@ def pixel_to_sky(wcs: WCS, x: np.ndarray, y: np.ndarray) -> SkyCoord:
 # Pixels.
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """Physical values of an image, which are read where they are indexed.
-
-    Attributes
-    ----------
-    raw : array-like
-        Pixels as stored: an array, or a section of a file that is read where it is indexed.
-    image : ImageFile
-        Image that the pixels belong to.
-    dtype : dtype
-        Type of the values.
-    """
-
-    raw: Any
-    image: ImageFile
-    dtype: DTypeLike = np.float32
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        key = key if isinstance(key, tuple) else (key,)
-        with reading(self.image.path):
-            # Index 0 along each leading axis.
-            raw = np.asarray(self.raw[(0,) * self.image.leading + key])
-            return self.image.physical(raw, self.dtype)
-
-
 @contextmanager
 def open_pixels(
-    image: ImageFile, *, in_pieces: bool, dtype: DTypeLike = np.float32
-) -> Iterator[Pixels]:
-    """Yield the values of an image, to be indexed without the leading axes.
+    image: ImageFile, *, in_pieces: bool, dtype: type[np.floating] = np.float32
+) -> Iterator[ImageFile]:
+    """Yield an image whose values are read where it is indexed, without the leading axes.
 
     Parameters
     ----------
@@ -697,8 +675,8 @@ def open_pixels(
     ObservationError
         If the file cannot be read, or its image has changed since it was found.
     """
-    if image.values is not None:
-        yield Pixels(image.values, image, dtype)
+    if image.raw is not None:
+        yield replace(image, dtype=dtype)
         return
     with ExitStack() as files:
         with reading(image.path):
@@ -708,4 +686,4 @@ def open_pixels(
             if tuple(hdu.shape)[image.leading :] != image.shape:
                 raise ObservationError(image.path, "has changed since it was opened")
             raw = hdu.section if in_pieces else hdu.data
-        yield Pixels(raw, image, dtype)
+        yield replace(image, raw=raw, dtype=dtype)

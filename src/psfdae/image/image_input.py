@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
-    from psfdae.image.containers import Image
+    from psfdae.image.containers import ImageLike
 
     Number: TypeAlias = float | Quantity
 else:
@@ -146,7 +146,7 @@ class ImageInput(ImageOptions):
         check_values(type(self).__init__, vars(self), Number=float | Quantity, StarList=Any)
 
     @classmethod
-    def build(cls, image: Image, options: Mapping[str, Any]) -> ImageInput:
+    def build(cls, image: ImageLike, options: Mapping[str, Any]) -> ImageInput:
         """Build the input from an image as Python hands it over, with its options.
 
         Parameters

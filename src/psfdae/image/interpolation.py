@@ -49,8 +49,8 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
             weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
     for axis in (np.array([1, 0]), np.array([0, 1])):
-        places = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
-        values, is_good = [wide_image[at] for at in places], [good[at] for at in places]
+        pixels = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
+        values, is_good = [wide_image[at] for at in pixels], [good[at] for at in pixels]
         has_line = is_good[1] & is_good[2]
         has_cubic = has_line & is_good[0] & is_good[3]
         line = 0.5 * (values[1] + values[2])

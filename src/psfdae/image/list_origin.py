@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.image.detection import Sky
+from psfdae.image.sky import Sky
 from psfdae.image.stamps import central_pixel, cut_image
 from psfdae.stars.moments import find_centroids, robust_scatter
 
@@ -27,7 +27,7 @@ def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.n
     Parameters
     ----------
     sky : Sky
-        Image less its sky (`flat`), noise per pixel (`noise`) and bad pixels (`bad`).
+        Image less its sky (`signal`), noise per pixel (`noise`) and bad pixels (`bad`).
     xy_px : ndarray, shape (n, 2)
         Positions x, y in px as the list has them, from 0 or from 1.
     fewest : int
@@ -44,12 +44,12 @@ def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.n
     """
     # Stamps of 13 × 13 px about the position for an origin of 0.5: the centroids start midway,
     # which favours neither origin. Stars whose stamp crosses the image's edge are left out.
-    shape = sky.flat.shape
+    shape = sky.signal.shape
     x, y = (xy_px - 0.5).T
     crosses_edge = cut_image(sky.bad, shape, x, y, stamp_px=13, margin=0)[2]
     xy_px = xy_px[~crosses_edge]
     x, y = (xy_px - 0.5).T
-    layers = sky.flat, sky.noise, sky.bad
+    layers = sky.signal, sky.noise, sky.bad
     stamps, noise, bad = (cut_image(v, shape, x, y, stamp_px=13, margin=0)[0] for v in layers)
     # Stars whose inner 5 × 5 pixels are good and stand 20 σ above the sky, the brightest 500.
     core = np.s_[:, 4:9, 4:9]

@@ -1,8 +1,8 @@
-"""Opening of an observation from an image, its star list and the user's options.
+"""Opening of an image, or of a cube of stamps, with its star list and the user's options.
 
-Input: `ImageInput`, the options. Output: `Observation`, with a camera that is checked against the
-pixels, the mask and the noise map, and listed or detected stars at their positions. Pixels are read
-to find stars, and where there is a noise map; stamps are cut later.
+Input: `ImageInput`, the options. Output: `Image` or `StampCube`, with a camera that is checked
+against the pixels, the mask and the noise map, and listed or detected stars at their positions.
+Pixels are read to find stars, and where there is a noise map; stamps are cut later.
 
 Faults of a file raise `ObservationError`, with one line that names the file.
 """
@@ -10,7 +10,7 @@ Faults of a file raise `ObservationError`, with one line that names the file.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from psfdae.base.errors import keyword
 from psfdae.base.progress import task
 from psfdae.image.camera import (
     LARGEST_STAMP_PX,
+    CameraValue,
     camera_values,
     check_camera,
     refuse_colours,
@@ -25,24 +26,25 @@ from psfdae.image.camera import (
     unread_card_remarks,
 )
 from psfdae.image.catalogue import Catalogue, as_catalogue
-from psfdae.image.detection import Sky
+from psfdae.image.detection import find_sources
 from psfdae.image.errors import ObservationError, shorten, silent
 from psfdae.image.fits_file import ImageFile, find_image
+from psfdae.image.image import Image, PixelCache
 from psfdae.image.image_input import ImageInput
-from psfdae.image.layers import Layers, add_photon_noise, find_layers
-from psfdae.image.observation import ListedStars, Observation
-from psfdae.image.positions import (
-    SAME_STAR_PX,
-    add_origin,
-    find_repeated_rows,
-    is_on_image,
-    positions_in_image,
-)
+from psfdae.image.layers import NoiseMap, find_layers, measure_photons
+from psfdae.image.list_origin import find_origin
+from psfdae.image.observation import ListedStars
+from psfdae.image.position_columns import Positions
+from psfdae.image.positions import SAME_STAR_PX, is_on_image, positions_in_image
+from psfdae.image.sky import Sky
+from psfdae.image.stamp_cube import StampCube
 from psfdae.image.stamps import StarFlag, raise_flag
 
+Opened = TypeVar("Opened", Image, StampCube)
 
-def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Observation:
-    """Open an image and its star list as an observation.
+
+def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Image | StampCube:
+    """Open an image or a cube of stamps, with its star list.
 
     Pixels are read to find stars, and where there is a noise map.
 
@@ -69,54 +71,101 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Obse
         option_text = keyword("bad_bits", source.bad_bits)
         raise ObservationError(source.path, f"{option_text}: expected 1 to 2**63 - 1")
     # The image, and whether it is a cube of stamps.
-    image = find_image(source.image, source.extension)
-    user_camera = source.camera(image.unit)
+    data = find_image(source.image, source.extension)
+    user_camera = source.camera(data.unit)
     table = None if source.catalogue is None else as_catalogue(source.catalogue)
-    image, is_cube = image_or_cube(source, image, table, stamp_px)
+    data, is_cube = image_or_cube(source, data, table, stamp_px)
     # The camera: values of a header are used as far as the pixels do not contradict them.
-    camera, remarks = camera_values(image, user_camera), unread_card_remarks(image)
+    camera, remarks = camera_values(data, user_camera), unread_card_remarks(data)
     noise_correlation = 1.0
     if not is_cube:
-        camera, camera_remarks, noise_correlation = check_camera(image, camera)
-        remarks += [*camera_remarks, *sky_coordinate_remarks(image)]
+        camera, camera_remarks, noise_correlation = check_camera(data, camera)
+        remarks += [*camera_remarks, *sky_coordinate_remarks(data)]
     # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
-    image = image.to_noise_unit()
-    # Mask and noise map. The map is scaled to the scatter of the sky, in which stars are
-    # detected.
-    layers, layer_remarks = find_layers(source, image, is_cube, camera)
-    remarks += layer_remarks
-    detections, threshold = None, source.detection_sigma
-    if threshold is not None or layers.noise is not None:
-        with task("image", 2) as advance:
-            sky = layers.sky()
-            advance(1, "sky")
-            remarks += [f"{source.path}: {note}" for note in sky.notes]
-            if layers.noise is not None:
-                layers = replace(layers, noise=replace(layers.noise, scale=sky.noise_scale))
-                layers, camera, photon_remarks = add_photon_noise(layers, camera, sky)
-                remarks += photon_remarks
-            if threshold is not None:
-                detections = detect_stars(source.path, sky, threshold, image.unit_factor)
-    star_list = detections or table
-    stars, positions, list_remarks = locate_stars(source, image, star_list, layers, is_cube)
-    return Observation(
-        source.path,
-        stamp_px,
-        margin=min(margin, (image.shape[-1] - stamp_px) // 2) if is_cube else margin,
-        shape=None if is_cube else image.shape,
-        camera=camera,
-        positions=positions,
-        stars=stars,
-        header_cards=image.provenance(),
-        catalogue=None if table is None else table.path,
-        detections=detections,
-        colour_column=source.colour_column,
-        remarks=(*remarks, *list_remarks),
-        # The scale of a noise map includes it.
-        noise_correlation=noise_correlation if layers.noise is None else 1.0,
-        _list=table,
-        _layers=layers,
-    )
+    data = data.to_noise_unit()
+    mask, noise_map, layer_remarks = find_layers(source, data, is_cube)
+    # The noise of the electronics in counts: read noise / gain.
+    gain, read_noise = camera["gain"].value, camera["read noise"].value
+    fields: dict[str, Any] = {
+        "path": source.path,
+        "data": data,
+        "mask": mask,
+        "shape": data.shape,
+        "stamp_px": stamp_px,
+        "camera": camera,
+        "least_noise": read_noise / gain if read_noise and gain else 0.0,
+        "star_list": table,
+        "colour_column": source.colour_column,
+        "header_cards": data.provenance(),
+        "remarks": (*remarks, *layer_remarks),
+    }
+    if is_cube:
+        margin = min(margin, (data.shape[-1] - stamp_px) // 2)
+        # A position in a stamp is not a position on the sky.
+        fields["data"] = replace(data, wcs=None)
+        return add_stars(source, StampCube(**fields, margin=margin))
+    # The scale of a noise map includes the correlation of noise.
+    correlation = noise_correlation if noise_map is None else 1.0
+    image = Image(**fields, margin=margin, noise_map=noise_map, noise_correlation=correlation)
+    # The map is scaled to the scatter of the sky, in which stars are detected.
+    if source.detection_sigma is not None or noise_map is not None:
+        image = search_sky(source, image)
+    return add_stars(source, image)
+
+
+def search_sky(source: ImageInput, image: Image) -> Image:
+    """Measure the sky of an image, to scale its noise map and to find its stars.
+
+    Parameters
+    ----------
+    source : ImageInput
+        Options, of which the detection threshold is used.
+    image : Image
+        The image without its stars.
+
+    Returns
+    -------
+    Image
+        With remarks on the sky, `noise_map` to scale, and `detections` if stars are searched.
+
+    Raises
+    ------
+    ObservationError
+        If the sky cannot be measured, or no star is found.
+    """
+    threshold = source.detection_sigma
+    with task("image", 2) as advance:
+        sky = image.sky()
+        advance(1, "sky")
+        sky_notes = (f"{source.path}: {note}" for note in sky.notes)
+        image = replace(image, remarks=(*image.remarks, *sky_notes))
+        if image.noise_map is not None:
+            image = scale_noise_map(image, image.noise_map, sky)
+        if threshold is not None:
+            image = replace(image, detections=detect_stars(image, sky, threshold))
+    return image
+
+
+def scale_noise_map(image: Image, noise_map: NoiseMap, sky: Sky) -> Image:
+    """Scale the noise map of an image to the scatter of its sky, and find the photons in it.
+
+    If the map grows with the light of stars, it shows the gain, which is used if it is not known
+    otherwise, with a remark.
+    """
+    camera, remarks = image.camera, image.remarks
+    noise_map = replace(noise_map, scale=sky.noise_scale)
+    if slope := measure_photons(noise_map, sky):
+        # σ is scaled by the measured noise of the sky, and so is the slope of its square.
+        noise_map = replace(noise_map, photons=slope / noise_map.scale**2)
+        if camera["gain"].value is None:
+            # In the unit of the file, light / g is its variance.
+            gain, label = image.unit_factor / slope, noise_map.data.label
+            camera = camera | {"gain": CameraValue(gain, label)}
+            words = f"{label} grows with the light of the stars: gain {gain:.4g}"
+            remarks = (*remarks, f"{image.data.path}: {words}")
+    # With this map, the sky is measured anew when it is needed; bad pixels stay.
+    cache = PixelCache(image.bad_pixels)
+    return replace(image, noise_map=noise_map, camera=camera, remarks=remarks, cache=cache)
 
 
 def image_or_cube(
@@ -178,19 +227,17 @@ def image_or_cube(
     return image, not is_image
 
 
-def detect_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.0) -> Catalogue:
+def detect_stars(image: Image, sky: Sky, threshold: float) -> Catalogue:
     """Return the stars of an image that are `threshold` σ above its sky.
 
     Parameters
     ----------
-    path : Path
-        The image, for messages.
+    image : Image
+        The image, in whose unit the list is.
     sky : Sky
         The image without its sky.
     threshold : float
         In σ of the slightly smoothed image.
-    unit_factor : float
-        Factor from the unit of the list to the unit of the sky.
 
     Raises
     ------
@@ -201,43 +248,31 @@ def detect_stars(path: Path, sky: Sky, threshold: float, unit_factor: float = 1.
 
     with silent():
         # The list has the columns of SExtractor, as a list in a file might.
-        table = Table(sky.stars(threshold))
+        table = Table(find_sources(sky, threshold))
         for name in {"FLUX_ISO", "BACKGROUND"}.intersection(table.colnames):
-            table[name] /= unit_factor
+            table[name] /= image.unit_factor
     if len(table) == 0:
         raise ObservationError(
-            path,
+            image.path,
             f"no star {threshold:g} σ above the sky; {keyword('threshold')} sets another limit",
         )
-    return Catalogue(path, table)
+    return Catalogue(image.path, table)
 
 
-def locate_stars(
-    source: ImageInput, image: ImageFile, table: Catalogue | None, layers: Layers, is_cube: bool
-) -> tuple[ListedStars, np.ndarray | None, list[str]]:
-    """Return the stars of a list, or of a cube without one, with their positions.
+def add_stars(source: ImageInput, image: Opened) -> Opened:
+    """Return an image or cube with the stars of its list, or of a cube without one.
 
     Parameters
     ----------
     source : ImageInput
         Options, of which the origin and the columns of the list are used.
-    image : ImageFile
-        Image or cube, with the WCS.
-    table : Catalogue or None
-        Star list, or the stars that were found in the image.
-    layers : Layers
-        The image with its sky, from which an unknown origin of the list is estimated.
-    is_cube : bool
-        The image is a cube of stamps.
+    image : Image or StampCube
+        Without its stars. If the origin of the list is unknown, its sky is measured.
 
     Returns
     -------
-    stars : ListedStars
-        Columns of the list.
-    positions : ndarray or None, shape (n, 2)
-        0-based x and y; None for a cube without a list of pixel positions.
-    remarks : list of str
-        Sentences on the list's origin, and on rows of the same star.
+    Image or StampCube
+        With `stars`, `positions`, and remarks on the list's origin, and on rows of the same star.
 
     Raises
     ------
@@ -246,8 +281,9 @@ def locate_stars(
     """
     # Without a list, stars are numbered and their positions are unknown.
     remarks: list[str] = []
-    positions = None
-    count = len(table) if table is not None else image.shape[0] if len(image.shape) == 3 else 1
+    positions: Any = None  # of a cube; an image has a list
+    table, shape = image.detections or image.star_list, image.shape
+    count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
     identifiers = np.arange(count, dtype=np.int64)
     flags = np.zeros(count, dtype=np.uint16)
     if table is not None:
@@ -256,20 +292,10 @@ def locate_stars(
         if source.origin is not None:
             columns = replace(columns, origin=source.origin)
         # If neither the user nor the list gives the pixel origin, estimate it from the stars.
-        if columns.origin is None and not (columns.sky or is_cube):
-            columns, remarks = add_origin(table, columns, layers)
-        positions = positions_in_image(image, table, columns, is_cube)
+        if columns.origin is None and not columns.sky and isinstance(image, Image):
+            columns, remarks = add_origin(table, columns, image)
+        positions = positions_in_image(image.data, table, columns, isinstance(image, StampCube))
         identifiers, flags = table.identifiers(), table.flags(columns)
-        # Rows that repeat a star of an earlier row are flagged.
-        if positions is not None and not is_cube and source.detection_sigma is None:
-            is_repeated = find_repeated_rows(positions)
-            raise_flag(flags, StarFlag.BLENDED, is_repeated)
-            if rows := [str(row + 1) for row in np.flatnonzero(is_repeated)]:
-                subject = "row is" if len(rows) == 1 else "rows are"
-                remarks.append(
-                    f"{table.path}: {len(rows)} {subject} within {SAME_STAR_PX:g} px of an earlier "
-                    f"one ({shorten(rows)}): flagged BLENDED, and not learnt from"
-                )
     # Columns that the user names; NaN where the list gives no number, or without a name.
     numbers = [np.full(count, np.nan) for _ in range(3)]
     for k, name in enumerate((source.flux_column, source.background_column, source.colour_column)):
@@ -278,9 +304,45 @@ def locate_stars(
         if name is not None and table is not None:
             numbers[k] = table.numbers(name)
     stars = ListedStars(identifiers, np.arange(count), numbers[0], numbers[1], numbers[2], flags)
-    # A list may cover a larger part of the sky than the image.
-    if source.on_image and positions is not None and not is_cube:
-        # Rows keep their numbers in the list.
-        is_selected = is_on_image(positions, image.shape)
-        stars, positions = stars.select(is_selected), positions[is_selected]
-    return stars, positions, remarks
+    image = replace(image, stars=stars, positions=positions)
+    # Rows that repeat a star of an earlier row are flagged.
+    is_repeated = image.find_repeated_stars()
+    raise_flag(flags, StarFlag.BLENDED, is_repeated)
+    if rows := [str(row + 1) for row in np.flatnonzero(is_repeated)]:
+        subject = "row is" if len(rows) == 1 else "rows are"
+        remarks.append(
+            f"{image.catalogue}: {len(rows)} {subject} within {SAME_STAR_PX:g} px of an earlier "
+            f"one ({shorten(rows)}): flagged BLENDED, and not learnt from"
+        )
+    image = replace(image, remarks=(*image.remarks, *remarks))
+    # A list may cover a larger part of the sky than the image; rows keep their numbers.
+    if source.on_image and isinstance(image, Image):
+        return image.select(is_on_image(positions, shape))
+    return image
+
+
+def add_origin(table: Catalogue, columns: Positions, image: Image) -> tuple[Positions, list[str]]:
+    """Return the columns of a list with the origin that the stars of an image show.
+
+    Returns
+    -------
+    columns : Positions
+        Unchanged if the stars do not show it clearly, or no sky can be measured.
+    remarks : list of str
+        A sentence on the origin that was found.
+    """
+    # Centroids of the stars differ from the pixels of the list by the origin.
+    list_pixels = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
+    try:
+        data_origin = find_origin(image.sky(), list_pixels)
+    except ObservationError:  # no sky can be measured
+        data_origin = None
+    if data_origin is None:
+        return columns, []
+    origin, offset, count = data_origin
+    sentence = (
+        f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
+        f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
+        f"{keyword('origin')} states it"
+    )
+    return replace(columns, origin=origin), [sentence]

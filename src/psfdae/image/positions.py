@@ -6,7 +6,6 @@ not in the plane of the image.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,7 @@ from psfdae.base.types import WCS
 from psfdae.image.catalogue import Catalogue
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import ImageFile, sky_frame
-from psfdae.image.layers import Layers
-from psfdae.image.list_origin import TOLERANCE_PX, find_origin
+from psfdae.image.list_origin import TOLERANCE_PX
 from psfdae.image.position_columns import Positions
 from psfdae.image.stamps import LARGEST_POSITION_PX, central_pixel
 
@@ -83,33 +81,6 @@ def positions_in_image(
     if not is_cube:
         check_overlap(image, table, columns, positions)
     return positions
-
-
-def add_origin(table: Catalogue, columns: Positions, layers: Layers) -> tuple[Positions, list[str]]:
-    """Return the columns of a list with the origin that the stars of an image show.
-
-    Returns
-    -------
-    columns : Positions
-        Unchanged if the stars do not show it clearly, or no sky can be measured.
-    remarks : list of str
-        A sentence on the origin that was found.
-    """
-    # Centroids of the stars differ from the pixels of the list by the origin.
-    list_pixels = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
-    try:
-        data_origin = find_origin(layers.sky(), list_pixels)
-    except ObservationError:  # no sky can be measured
-        data_origin = None
-    if data_origin is None:
-        return columns, []
-    origin, offset, count = data_origin
-    sentence = (
-        f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
-        f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
-        f"{keyword('origin')} states it"
-    )
-    return replace(columns, origin=origin), [sentence]
 
 
 def is_on_image(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

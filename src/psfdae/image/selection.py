@@ -18,9 +18,11 @@ import numpy as np
 from psfdae.base.errors import Error, keyword
 from psfdae.base.progress import task
 from psfdae.base.settings import CalibrationStars, Stamp
+from psfdae.image.image import Image
 from psfdae.image.interpolation import fill_bad_stamps
 from psfdae.image.observation import Observation
-from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image, sky_around
+from psfdae.image.sky import sky_around
+from psfdae.image.stamps import Stamps, StarFlag, cut, cut_image
 from psfdae.image.star_criteria import (
     brightest_pixels,
     find_crowded,
@@ -168,7 +170,8 @@ def collect(
     CalibrationStarsError
         If there are fewer good stars than `calibration_stars.stars_min`.
     """
-    observation.check_list()
+    if isinstance(observation, Image):
+        observation.check_list()
     # Measure 2048 stars at a time; stamps of the good ones are kept.
     parts = []
     with task("stars of the image", observation.count) as advance:
@@ -250,9 +253,9 @@ def measure_stamps(
     wide_px = light.shape[-1]
     # Pixels outside the image; stamps of a cube lie within it.
     off_image = np.zeros(light.shape, dtype=bool)
-    if (shape := observation.shape) is not None:
-        nothing = np.broadcast_to(False, shape)
-        off_image = ~cut_image(nothing, shape, stamps.x, stamps.y, wide_px, margin=0)[1]
+    if isinstance(observation, Image):
+        nothing = np.broadcast_to(False, observation.shape)
+        off_image = ~cut_image(nothing, nothing.shape, stamps.x, stamps.y, wide_px, margin=0)[1]
     # Pixels far below the sky are dead, or of neighbours that were subtracted badly; these also
     # increase the noise that is measured around a star.
     depth = -BrightStars.defect_sigma * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]

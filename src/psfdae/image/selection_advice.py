@@ -25,20 +25,20 @@ def advice(candidates: Candidates, observation: Observation, stamp_px: int) -> l
 
 
 def saturation_advice(candidates: Candidates) -> str:
-    """Return advice on saturation, from the level at which brightest pixels pile up.
+    """Return advice on saturation, from the counts at which brightest pixels pile up.
 
     Stars that are cut off have the same brightest pixel, however bright they are.
     """
     # Counts at which brightest pixels agree; infinite if they do not.
-    level = find_pile_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
-    if not np.isfinite(level):
+    limit = find_pile_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
+    if not np.isfinite(limit):
         return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
-    star_count = np.count_nonzero(candidates.brightest >= level)
-    stamp_count = np.count_nonzero(candidates.highest >= level)
+    star_count = np.count_nonzero(candidates.brightest >= limit)
+    stamp_count = np.count_nonzero(candidates.highest >= limit)
     return (
-        f"saturation: the brightest pixels of {star_count} stars agree from {level:.6g} counts on, "
+        f"saturation: the brightest pixels of {star_count} stars agree from {limit:.6g} counts on, "
         f"as if cut off; {stamp_count} stamps have such pixels and are not learnt from, "
-        f"{keyword('saturate', level)} flags these, too"
+        f"{keyword('saturate', limit)} flags these, too"
     )
 
 
@@ -70,7 +70,7 @@ def stamp_advice(
     stamp_px : int
         Current side of the stamps.
     light_wanted : float
-        Part of a star's visible light that a stamp should hold.
+        Fraction of a star's visible light that a stamp should hold.
     step_px : int
         Minimum difference of the sides for which advice is given.
 

@@ -28,7 +28,7 @@ class SourceSize:
     radius_px : ndarray, shape (k,)
         Outer radii of rings, ascending, up to where the star meets the sky; then twice this radius.
     light : ndarray, shape (k,)
-        Part of the light within these radii; the last one is 1.
+        Fraction of the light within these radii; the last one is 1.
     peak_offset_px : float
         Median distance of the brightest pixel from the centre, the larger of row and column.
     sharpness_px : float
@@ -50,7 +50,7 @@ class SourceSize:
         return 2.0 * float(np.interp(0.5, light, radius))
 
     def light_within(self, side_px: int) -> float:
-        """Return the part of the light in a square, from a circle of the same area."""
+        """Return the fraction of the light in a square, from a circle of the same area."""
         radius = side_px / np.sqrt(np.pi)
         return float(np.interp(radius, np.append(0.0, self.radius_px), np.append(0.0, self.light)))
 
@@ -68,19 +68,19 @@ class SourceSize:
         """
         if not self.is_hollow and self.light_within(self.sides[0]) >= light_min:
             return self.sides[0]
-        edge_px, part = (2, 0.99) if self.is_hollow else (0, 0.98)
-        sides = (side for side in self.sides if self.light_within(side - edge_px) >= part)
+        edge_px, fraction = (2, 0.99) if self.is_hollow else (0, 0.98)
+        sides = (side for side in self.sides if self.light_within(side - edge_px) >= fraction)
         return next(sides, self.sides[-1])
 
 
 def measure_size(
-    flat: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, stars_max: int = 60
+    data: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, stars_max: int = 60
 ) -> SourceSize | None:
     """Measure the size of the stars of an image.
 
     Parameters
     ----------
-    flat : ndarray, shape (h, w)
+    data : ndarray, shape (h, w)
         Image without its sky.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -100,14 +100,14 @@ def measure_size(
 
     # The brightest stars by the light within 8 px; bad pixels are 0.
     pixel = np.floor(position[np.isfinite(position).all(axis=1)][:, ::-1] + 0.5).astype(np.int64)
-    pixel = pixel[((pixel >= 0) & (pixel < flat.shape)).all(axis=1)]
+    pixel = pixel[((pixel >= 0) & (pixel < data.shape)).all(axis=1)]
     if not len(pixel):
         return None
-    clean = np.where(bad, 0.0, flat)
+    clean = np.where(bad, 0.0, data)
     light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(pixel.T)]
     brightest = pixel[np.argsort(-light, kind="stable")[:stars_max]]
     # Windows (n, s, s) about them; pixels off the image are ignored.
-    windows_at = (flat.shape, brightest[:, 1], brightest[:, 0], 2 * reach_px + 1, 0)
+    windows_at = (data.shape, brightest[:, 1], brightest[:, 0], 2 * reach_px + 1, 0)
     windows, inside, _ = cut_image(clean, *windows_at)
     is_measured = inside & (cut_image(bad, *windows_at)[0] == 0)
     # The centre under a window as wide as the star, from the first profile.

@@ -1,21 +1,20 @@
-"""Stamps of stars: the container, flags of stars, and how stamps are cut, measured and centred.
+"""Stamps of stars: the container, flags of stars, and how stamps are cut and centred.
 
-A stamp is a square of pixels about a star, sky included. Stamps are cut at positions in an image;
-sky, scatter and displacement of each stamp are measured.
+A stamp is a square of pixels about a star, sky included. Stamps are cut at positions in an image,
+and the displacement of each is measured. `psfdae.image.sky` measures their sky.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, fields
 from enum import IntFlag
-from functools import cache
 from typing import Self
 
 import numpy as np
 
-from psfdae.image.fits_file import Pixels
-from psfdae.stars.moments import FWHM_OF_SIGMA, count_step, dither, remove_dither
+from psfdae.image.fits_file import ImageFile
+from psfdae.image.sky import border_scatter
+from psfdae.stars.moments import FWHM_OF_SIGMA
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,8 @@ class Stamps:
         Flux inside the stamp, sky level, and RMS of the sky in a pixel; NaN where they are to be
         estimated.
     noise_correlation : ndarray, shape (n,)
-        Noise of sums of pixels of the sky over the noise of sums of independent pixels, at least 1.
+        Ratio of the noise of sums of pixels of the sky to the noise of sums of independent pixels,
+        at least 1.
     gain : ndarray, shape (n,)
         Electrons per unit of the stamps.
     magnitude : ndarray, shape (n,)
@@ -150,7 +150,7 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
 
 
 def cut_image(
-    pixels: Pixels | np.ndarray,
+    pixels: ImageFile | np.ndarray,
     shape: tuple[int, ...],
     x: np.ndarray,
     y: np.ndarray,
@@ -161,7 +161,7 @@ def cut_image(
 
     Parameters
     ----------
-    pixels : Pixels or ndarray, shape (h, w)
+    pixels : ImageFile or ndarray, shape (h, w)
         The image, indexed once with arrays of rows and columns.
     shape : tuple of int
         Rows and columns of the image.
@@ -196,113 +196,6 @@ def cut_image(
     # A star is whole if all rows and columns of its stamp, margin aside, are on the image.
     is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
     return stamps, inside, np.asarray(~is_whole)
-
-
-# The border of a stamp and its surroundings, where the sky is measured.
-
-
-@cache
-def border_pixels(side: int) -> np.ndarray:
-    """Return the flat indices of the ring at the edge of a stamp, an eighth of its side wide."""
-    width = max(1, side // 8)
-    border = np.ones((side, side), dtype=bool)
-    border[width:-width, width:-width] = False
-    return np.flatnonzero(border)
-
-
-def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Return the median of the good pixels in the border of every stamp (n, s, s).
-
-    Returns
-    -------
-    ndarray, shape (n,), float64
-        Median of all good pixels if the border has no good pixel; 0 if no pixel is good.
-    """
-    size = (len(stamps), stamps.shape[-1] ** 2)
-    flat, hidden = stamps.reshape(size), bad.reshape(size)
-    ring = border_pixels(stamps.shape[-1])
-    # All stamps at once, then those with bad pixels one by one.
-    median = np.median(flat[:, ring], axis=1).astype(np.float64)
-    for star in np.flatnonzero(hidden.any(axis=1)):
-        good = flat[star, ring][~hidden[star, ring]]
-        good = good if good.size else flat[star][~hidden[star]]
-        median[star] = np.median(good) if good.size else 0.0
-    return median
-
-
-def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
-    """Return σ of the pixels in the border of every stamp from their median deviation.
-
-    Light of the star in the border increases it.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (n, s, s)
-        Stamps, with or without sky.
-    bad : ndarray of bool, shape (n, s, s), optional
-        Pixels that are left out, unless all are bad.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        σ of each stamp.
-    """
-    from astropy.stats import mad_std
-
-    size = (len(stamps), stamps.shape[-1] ** 2)
-    border = border_pixels(stamps.shape[-1])
-    ring = stamps.reshape(size)[:, border]
-    if bad is None:
-        return np.asarray(mad_std(ring, axis=1), np.float64)
-    # Bad pixels of the ring are left out, unless the whole ring is bad.
-    hidden = bad.reshape(size)[:, border]
-    hidden &= ~hidden.all(axis=1, keepdims=True)
-    ring = np.where(hidden, np.nan, ring)
-    return np.asarray(mad_std(ring, axis=1, ignore_nan=True), np.float64)
-
-
-def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return median and scatter of the pixels outside the stamps, other stars clipped.
-
-    Without a margin (s < d + 4) the pixels are the outer two rows and columns of the stamp itself,
-    in which light of the star is taken for sky.
-
-    Parameters
-    ----------
-    window : ndarray, shape (n, s, s)
-        Stamps with their margins.
-    bad : ndarray of bool, shape (n, s, s)
-        Pixels that are ignored.
-    stamp_px : int
-        Side d of the stamps.
-
-    Returns
-    -------
-    level, noise : ndarray, shape (n,)
-        Median and σ, in counts per pixel; 0 where all pixels are bad.
-    """
-    from astropy.stats import sigma_clipped_stats
-
-    # The ring around the stamp.
-    side = window.shape[-1]
-    hole_px = stamp_px if side >= stamp_px + 4 else side - 4
-    start = side // 2 - hole_px // 2
-    ring = np.ones((side, side), dtype=bool)
-    ring[start : start + hole_px, start : start + hole_px] = False
-    # Dither whole counts, so that medians are not rounded.
-    step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
-    window, dither_variance = dither(window, step)
-    # Pixels of the ring more than 3 σ off their median belong to other stars.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
-        _, level, noise = sigma_clipped_stats(
-            window[:, ring], mask=bad[:, ring], sigma=3.0, stdfunc="mad_std", axis=1
-        )
-    # If all pixels of all stamps are bad, both are one masked value; bad stamps get 0.
-    statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
-    statistics = np.nan_to_num(statistics).astype(float)
-    level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
-    return level, np.where(noise > 0, remove_dither(noise, dither_variance), 0.0)
 
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).

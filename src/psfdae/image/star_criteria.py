@@ -70,14 +70,14 @@ def find_pile_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray)
     """Return the counts at which brightest pixels of stars pile up; infinite if none do.
 
     Stars of the same brightness have the same brightest pixels, too. In stars that are cut off, the
-    brightest pixel is a smaller part of the star than in others.
+    brightest pixel has a smaller fraction of the light than in others.
 
     Parameters
     ----------
     brightest : ndarray, shape (n,)
         Brightest pixel of every star in counts, sky included.
     sky, brightness : ndarray, shape (n,)
-        Level in counts, and light of the star in any unit.
+        Sky in counts, and light of the star in any unit.
     """
     height = brightest - sky
     top = height.max(initial=0.0)
@@ -86,14 +86,14 @@ def find_pile_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray)
     fainter = (height >= 0.1 * top) & ~is_piled
     if top <= 0 or is_piled.sum() < 3 or not fainter.any():
         return np.inf
-    # If cut off, they are a smaller part of their star than in fainter stars, by a tenth.
+    # If cut off, they have a smaller fraction of the light than in fainter stars, by a tenth.
     sharpness = height / np.where(brightness > 0, brightness, 1.0)
     if np.median(sharpness[is_piled]) > 0.9 * np.median(sharpness[fainter]):
         return np.inf
-    # Six digits, rounded down, so that the printed level is the exact one.
-    level = float(brightest[is_piled].min())
-    unit = 10.0 ** (np.floor(np.log10(level)) - 5) if level > 0 else 1.0
-    return float(f"{np.floor(level / unit * (1 + 1e-12)) * unit:.6g}")
+    # Six digits, rounded down, so that the printed number is the exact one.
+    pile_up = float(brightest[is_piled].min())
+    unit = 10.0 ** (np.floor(np.log10(pile_up)) - 5) if pile_up > 0 else 1.0
+    return float(f"{np.floor(pile_up / unit * (1 + 1e-12)) * unit:.6g}")
 
 
 # Neighbours.
@@ -111,7 +111,7 @@ def find_crowded(
     brightness : ndarray, shape (n,)
         Brightness of the stars in any linear unit.
     distance_px, ratio : float
-        Maximum distance of a neighbour, and its minimum brightness over the brightness of the star.
+        Maximum distance of a neighbour, and the minimum ratio of its brightness to the star's.
     """
     # Each pair in both orders.
     indices = np.flatnonzero(np.isfinite(position).all(axis=1))
@@ -124,7 +124,7 @@ def find_crowded(
 
 
 def measure_overlap(position: np.ndarray, side: int) -> float:
-    """Return the part of the stars (n, 2) whose stamps of a side contain another star."""
+    """Return the fraction of the stars (n, 2) whose stamps of a side contain another star."""
     # Distance of the nearest other star along the farther axis, as stamps are squares.
     finite = position[np.isfinite(position).all(axis=1)]
     if len(finite) < 2:
@@ -283,7 +283,7 @@ def misfit(
     position : ndarray, shape (n, 2)
         (x, y) in the image; if one is not finite, all stars are neighbours of each other.
     noise : ndarray, shape (n,)
-        RMS of a pixel over the flux.
+        Ratio of the RMS of a pixel to the flux.
     companions : int
         Number of nearest stars with which a star is compared.
     """

@@ -18,7 +18,7 @@ from psfdae.base.progress import steps
 from psfdae.base.types import Table
 from psfdae.denoise.denoiser import MAX_CHI2
 from psfdae.denoise.flux_model import is_faint
-from psfdae.image.observation import Observation
+from psfdae.image.image import Image
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.photometry.joint_fit import JointFit, chains, fit_stars, pairs_within
 from psfdae.photometry.matched_filter import find_stars
@@ -94,7 +94,7 @@ class CrowdedPhotometry:
 
 
 def photometry(
-    model: FieldPsfs, observation: Observation, threshold: float = RESIDUAL_SNR, turns: int = 5
+    model: FieldPsfs, observation: Image, threshold: float = RESIDUAL_SNR, turns: int = 5
 ) -> CrowdedPhotometry:
     """Fit positions and fluxes of all stars of an image.
 
@@ -102,7 +102,7 @@ def photometry(
     ----------
     model : FieldPsfs
         That knows the PSF at every place of this image.
-    observation : Observation
+    observation : Image
         The image with its stars. If they come from a list, no others are searched for.
     threshold : float
         Minimum S/N of stars that are found where the models of others are subtracted.
@@ -118,7 +118,7 @@ def photometry(
     """
     from scipy.ndimage import map_coordinates
 
-    observation, unit = observation.to_sky_unit(), observation.unit_factor
+    unit, (gain, limit) = observation.unit_factor, observation.camera_in_sky_unit()
     # PSFs of the field, and lengths that follow from the PSF in its middle.
     psfs = PsfGrid.sample(model, by_magnitude=True).times(unit)
     fwhm, side = model.fwhm_px(), model.stamp_px
@@ -128,9 +128,9 @@ def photometry(
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
     # The image with its sky; saturated pixels are not fitted.
-    sky, limit = observation.sky(), observation.saturate
-    image = sky.flat + sky.level
-    is_saturated = np.zeros(image.shape, dtype=bool) if limit is None else image >= limit
+    sky = observation.sky()
+    image = sky.signal + sky.level
+    is_saturated = image >= limit
     bad = sky.bad | is_saturated
     sky = replace(sky, bad=bad)
     # Stars start where the list or the detection has them, with the wings of the model.
@@ -138,7 +138,7 @@ def photometry(
     place = origin
     wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
-    error = pixel_error(sky.noise, sky.flat, observation.gain)
+    error = pixel_error(sky.noise, sky.signal, gain)
     # Positions of all stars that were found in residuals: each is tried once.
     peaks = np.empty((0, 2))
     for turn in steps("photometry", range(turns)):
@@ -155,7 +155,7 @@ def photometry(
             image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, is_saturated
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
-        error = pixel_error(sky.noise, fit.light + wing_light, observation.gain)
+        error = pixel_error(sky.noise, fit.light + wing_light, gain)
         # Two fits at least; one more with halos, whose first measurement lacks the light that the
         # first fluxes have too much.
         is_last = turn > (1 if halo_error.any() else 0)
@@ -173,7 +173,7 @@ def photometry(
         if observation.detections is not None and turn < turns - 2:
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
             positions = np.concatenate([place, peaks])
-            new, new_flux = find_stars(psfs, sky.flat, sigma, positions, threshold, fwhm)
+            new, new_flux = find_stars(psfs, sky.signal, sigma, positions, threshold, fwhm)
             place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
             flux = np.append(flux, new_flux)
         if is_last and real.all() and len(place) == len(real):
@@ -189,7 +189,7 @@ def photometry(
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
     light = fit.light + wing_light
     # In the unit of the image.
-    return CrowdedPhotometry(model, stars, sky.flat, light, wings_used, wings, chi2_ratio).times(
+    return CrowdedPhotometry(model, stars, sky.signal, light, wings_used, wings, chi2_ratio).times(
         1.0 / unit
     )
 
@@ -217,7 +217,7 @@ def find_duplicates(
 
 def tabulate_stars(
     model: FieldPsfs,
-    observation: Observation,
+    observation: Image,
     fit: JointFit,
     origin: np.ndarray,
     wings: Wings | None,
@@ -230,8 +230,8 @@ def tabulate_stars(
     ----------
     model : FieldPsfs
         Model of the PSFs, with their errors.
-    observation : Observation
-        The image with its stars, in the unit of the fit.
+    observation : Image
+        The image with its stars.
     fit : JointFit
         All stars, with their fluxes in the stamps.
     origin : ndarray, shape (n, 2)

@@ -17,6 +17,7 @@ from psfdae.base.types import WCS, CCDData, QTable, Table
 from psfdae.denoise.image_prediction import CAUSES
 from psfdae.image.catalogue import StarList, as_catalogue
 from psfdae.image.errors import ascii_line
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
@@ -119,7 +120,7 @@ def measure_all_stars(
     # as large as the image's.
     model.field_range()
     observation = opened or open_observation(source, model.stamp_px).assume_scale()
-    if observation.shape is None:
+    if not isinstance(observation, Image):
         raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
     model.check_scale(observation.pixel_scale_arcsec, str(source.path))
     # The image may show another part of the detector than the training.
@@ -159,7 +160,7 @@ def measure_all_stars(
 
 
 def measure_stars(
-    model: FieldPsfs, observation: Observation, threshold: float | None = None, turns: int = 5
+    model: FieldPsfs, observation: Image, threshold: float | None = None, turns: int = 5
 ) -> tuple[CrowdedPhotometry, str | None]:
     """Measure the stars that can be measured, and return a row for every star of the list.
 
@@ -167,7 +168,7 @@ def measure_stars(
     ----------
     model : FieldPsfs
         Model that knows the PSF at every position.
-    observation : Observation
+    observation : Image
         The image with its stars.
     threshold : float, optional
         Minimum S/N of stars that are found in residuals.
@@ -222,21 +223,20 @@ def light_notes(star_fit: CrowdedPhotometry, source: ImageInput) -> list[str]:
     return notes
 
 
-def add_unmeasured_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
+def add_unmeasured_rows(stars: Table, observation: Image, unusable: np.ndarray) -> Table:
     """Return a row for every star of the list; those that were not measured have NaN and flags.
 
     Parameters
     ----------
     stars : Table
         A row for each star that was measured, in the order of the list.
-    observation : Observation
+    observation : Image
         All stars of the list.
     unusable : ndarray of bool, shape (n,)
         Rows that were not measured.
     """
     from astropy.table import Table
 
-    assert observation.positions is not None
     # Each column with 0 or NaN in the rows that were not measured.
     rows = Table()
     for name in stars.colnames:
@@ -301,7 +301,7 @@ def measure_zero_point(
 
 
 def photometry_table(
-    star_fit: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
+    star_fit: CrowdedPhotometry, observation: Image, zero_point: float | None = None
 ) -> QTable:
     """Return the stars with units, magnitudes, sky coordinates and the columns of their list.
 
@@ -309,7 +309,7 @@ def photometry_table(
     ----------
     star_fit : CrowdedPhotometry
         The stars; one for every star of the observation if these are of a list.
-    observation : Observation
+    observation : Image
         The image, which has the unit of the fluxes and, perhaps, a WCS.
     zero_point : float, optional
         Magnitude of a flux of 1; if None, the table lacks magnitudes.

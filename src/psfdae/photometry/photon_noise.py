@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from psfdae.image.camera import CameraValue
-from psfdae.image.observation import Observation
+from psfdae.image.image import Image
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import SIGMA_OF_MAD
@@ -27,7 +27,7 @@ def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.
     return np.hypot(noise, np.sqrt(np.maximum(light, 0.0) / gain)) if gain else noise
 
 
-def add_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
+def add_measured_gain(model: FieldPsfs, observation: Image) -> Image:
     """Return the observation with the gain that its stars show, if it is not known.
 
     It stays unknown where they do not show it at 5 σ, as in an image without photon noise.
@@ -39,11 +39,11 @@ def add_measured_gain(model: FieldPsfs, observation: Observation) -> Observation
     ObservationError
         If the sky cannot be measured.
     """
-    if observation.gain is not None or observation.positions is None:
+    if observation.gain is not None:
         return observation
-    sky, limit = observation.sky(), observation.to_sky_unit().saturate
-    bad = sky.bad if limit is None else sky.bad | (sky.flat + sky.level >= limit)
-    gain_and_error = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
+    sky, (_, limit) = observation.sky(), observation.camera_in_sky_unit()
+    bad = sky.bad | (sky.signal + sky.level >= limit)
+    gain_and_error = measure_gain(model, sky.signal, sky.noise, bad, observation.positions)
     if gain_and_error is None:
         return observation
     gain = gain_and_error[0] * observation.unit_factor

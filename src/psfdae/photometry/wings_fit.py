@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.base.progress import steps
-from psfdae.image.detection import Sky, find_sky
+from psfdae.image.sky import Sky, subtract_sky
 from psfdae.image.sky_level import level_and_noise
 from psfdae.image.trails import find_saturated_cores
 from psfdae.psf.wings import Wings, compute_prior_profile, tents
@@ -253,7 +253,7 @@ def around_stars(
     Returns
     -------
     sky : Sky
-        Sky without wings; its `flat` is what is left without sky, stars and wings.
+        Sky without wings; its `signal` is what is left without sky, stars and wings.
     light_of_wings : ndarray, shape (h, w)
         With the halos of saturated cores.
     wings : Wings or None
@@ -268,7 +268,7 @@ def around_stars(
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
     without_light = without_stars - light_of_wings
-    sky = find_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
+    sky = subtract_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
     del without_light
     # The map estimates the mode, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
@@ -280,9 +280,9 @@ def around_stars(
     weight *= weight
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
-    sky = replace(sky, level=sky.level + even_light, flat=sky.flat - even_light)
+    sky = replace(sky, level=sky.level + even_light, signal=sky.signal - even_light)
     halo_error = subtract_halos(
-        sky.flat, light_of_wings, sky.bad, sigma, stars, wings, is_saturated
+        sky.signal, light_of_wings, sky.bad, sigma, stars, wings, is_saturated
     )
     return sky, light_of_wings, wings, halo_error
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from psfdae.base.errors import Error
 from psfdae.base.rng import stream
-from psfdae.image.stamps import Stamps, border_median, border_scatter
+from psfdae.image.sky import border_median, border_scatter
+from psfdae.image.stamps import Stamps
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 SIGMA_OF_MAD = 1.4826
-"""Standard deviation of a normal variable over the median of its modulus."""
+"""Ratio of the standard deviation of a normal variable to the median of its modulus."""
 
 FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
-"""FWHM of a Gaussian over its standard deviation."""
+"""Ratio of the FWHM of a Gaussian to its standard deviation."""
 
 
 def robust_scatter(values: np.ndarray) -> np.ndarray:
@@ -104,18 +104,20 @@ def shift_stamps(
     shifted_stamps, knots = np.empty((len(stamp), side, side)), side + 2 * margin
     pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
     for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
-        place = np.clip(pixels - shift[part, :, None], -farthest, farthest)
-        rows, columns = cubic_splines(place, knots, 1.0).swapaxes(0, 1)
+        position = np.clip(pixels - shift[part, :, None], -farthest, farthest)
+        rows, columns = cubic_splines(position, knots, 1.0).swapaxes(0, 1)
         shifted_stamps[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
     return shifted_stamps
 
 
-def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
+def cubic_splines(
+    position: np.ndarray, knots: int, spacing: float, slope: bool = False
+) -> np.ndarray:
     """Return the values of cubic B-splines at some positions, or their slopes.
 
     Parameters
     ----------
-    place : ndarray, shape (…)
+    position : ndarray, shape (…)
         Positions in pixels.
     knots : int
         Number of equidistant knots; position 0 lies in their middle.
@@ -132,9 +134,9 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
     # At a fraction t of the way from one knot to the next, only the splines of two knots on each
     # side are not 0: the cubic B-spline is ((1−t)³, 4 − 3t²(2−t), 4 − 3(1−t)²(1+t), t³)/6 there
     # (de Boor 1978, A Practical Guide to Splines).
-    knot_place = place / spacing + (knots - 1) / 2
-    first = np.floor(knot_place)
-    t = knot_place - first
+    knot_position = position / spacing + (knots - 1) / 2
+    first = np.floor(knot_position)
+    t = knot_position - first
     if slope:
         # Their derivatives with respect to the position.
         values = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
@@ -145,10 +147,10 @@ def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = F
         scale = 6.0
     # Four more knots on each side hold values of knots that do not exist; they are cut off.
     count = knots + 8
-    matrix = np.zeros((*place.shape, count))
+    matrix = np.zeros((*position.shape, count))
     knot = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
     # Index of the first of the four knots of each position, all knots in one row.
-    index = np.arange(place.size).reshape(place.shape) * count + knot + 3
+    index = np.arange(position.size).reshape(position.shape) * count + knot + 3
     for number, value in enumerate(values):
         matrix.reshape(-1)[index + number] = value / scale
     return matrix[..., 4:-4]

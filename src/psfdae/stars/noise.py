@@ -109,7 +109,7 @@ def noise_equivalent_px(psf: np.ndarray) -> float:
     Σp². The mean of the images would be wider than each image, because the stars have different
     positions in their stamps.
     """
-    # n/Σp² over all images is 1 over the mean of Σp².
+    # n/Σp² of all images is the inverse of the mean of Σp².
     count = len(psf) if psf.ndim == 3 else 1
     return count / float(np.square(psf, dtype=np.float64).sum())
 
@@ -121,7 +121,7 @@ class OwnNoise:
     Attributes
     ----------
     noise : ndarray, shape (n,)
-        RMS of the sky noise in a pixel over the flux, for every image before its shift.
+        Ratio of the RMS of the sky noise in a pixel to the flux, of every image before its shift.
     background : float
         Sky level in photons per pixel.
     phase : ndarray, shape (n, 2)
@@ -149,21 +149,21 @@ class OwnNoise:
         mean : ndarray, shape (P,)
             Mean of these images, of sum 1.
         """
-        # The mean contains a share of the noise of each star, which is no scatter about the mean.
+        # The mean contains a fraction of the noise of each star: no scatter about the mean.
         _, star, count = np.unique(self.star[images], return_inverse=True, return_counts=True)
-        part = 1.0 - count[star] / images.size
+        fraction = 1.0 - count[star] / images.size
         noise, side = self.noise[images], round(mean.size**0.5)
-        sky = part * noise**2
+        sky = fraction * noise**2
         # Correlation of pixels: covariance of shifted white noise, averaged over the shifts of the
         # images, for pairs of pixels (a, c) along rows and (b, d) along columns.
         along = compute_shifted_noise(side)
         phases = len(along)
-        place = np.rint(2 * (phases - 1) * np.abs(self.phase[images])).astype(int)
-        share = np.zeros((phases, phases))
-        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), 1e-300))
-        pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(share, along, 1))
+        index = np.rint(2 * (phases - 1) * np.abs(self.phase[images])).astype(int)
+        weight = np.zeros((phases, phases))
+        np.add.at(weight, (index[:, 0], index[:, 1]), sky / max(sky.sum(), 1e-300))
+        pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(weight, along, 1))
         # RMS of each pixel, by the sky and by the photons of the mean star.
-        photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
+        photons = (fraction * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
         rms = np.sqrt(sky.sum() + photons)
         covariance = pairs.reshape(mean.size, mean.size) * rms * rms[:, None]
         # Images have the sum 1: x − Σx m has no noise along the mean m.

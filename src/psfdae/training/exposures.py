@@ -13,6 +13,7 @@ from psfdae.base.version import __version__
 from psfdae.denoise.bundle import creation_date
 from psfdae.denoise.image_prediction import other_instrument
 from psfdae.denoise.star_model import StarModel
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
@@ -75,7 +76,7 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     calibration = settings.calibration_stars.model_copy(update={"stars_min": MIN_STARS_WITH_ERROR})
     # The image must have the pixels of the training; another filter is only reported.
     observation = open_observation(source, info.stamp_px, calibration.margin_px).assume_scale()
-    if observation.shape is None:
+    if not isinstance(observation, Image):
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
     model, frame_notes = model.to_image_frame(observation)
@@ -199,7 +200,7 @@ def _adapt(model: Model, observation: Observation, bright: BrightStars, name: st
         "image": observation.path.name,
         "image_sha256": observation.sha256(),
         "trained_on": training.get("image_sha256", ""),
-        "image_px": [*reversed(observation.shape or ())],
+        "image_px": [*reversed(observation.shape)],
         "detector": observation.detector_frames,
         "instrument": observation.instrument,
         "adapted": {"from": model.sha256, "stars": len(bright)},

@@ -13,6 +13,7 @@ from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError
 from psfdae.base.threads import fix_threads
 from psfdae.denoise.star_model import StarModel
+from psfdae.image.image import Image
 from psfdae.methods import list_groups
 from psfdae.methods import method as method_of
 from psfdae.methods.fit_files import describe_fit
@@ -175,7 +176,7 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
         model = build_model(
             method_fit, stars.product, ImageStars.reference, settings, description, name, licence
         )
-        if not method_fit.knows_field or stars.observation.shape is None:
+        if not method_fit.knows_field:
             return model
         # Light outside the stamps, as the photometry of each image with this model measures it:
         # `flux_total` of a star and its flux by photometry are the same. Stars that are found in
@@ -183,6 +184,8 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
         # later fits by less than a quarter of one: three fits are enough.
         wings = []
         for image in stars.images:
+            if not isinstance(image.observation, Image):
+                continue
             observation = add_measured_gain(model, image.observation.assume_scale())
             photometry, _ = measure_stars(model, observation, image.source.given_threshold, 3)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict
+from psfdae.image.stamp_cube import StampCube
 from psfdae.training.neighbours import subtract_neighbours
 from psfdae.training.settings import Settings
 from psfdae.training.star_choice import (
@@ -48,7 +50,8 @@ def collect_stars(sources: Sequence[ImageInput], settings: Settings) -> ImageSta
         for source in sources
     ]
     for observation in observations:
-        observation.check_planes()
+        if isinstance(observation, StampCube):
+            observation.check_planes()
     require_one_camera(observations)
     observations, candidates, relaxed_settings, notes = choose_bright_stars(observations, settings)
     # Bright stars of each image; in a crowded image again without their neighbours.
@@ -79,8 +82,8 @@ def is_crowded(stars: ImageStars) -> bool:
         Stars of one image.
     """
     # Neighbours can only be fitted in an image with known positions, not in a cube of stamps.
-    has_image = stars.observation.shape is not None
-    if not has_image or not np.isfinite(stars.candidates.bright.position).all():
+    is_image = isinstance(stars.observation, Image)
+    if not is_image or not np.isfinite(stars.candidates.bright.position).all():
         return False
     # With fewer than 5 stars, a field cannot be fitted; if fewer stars have neighbours than not,
     # the stars without are enough.

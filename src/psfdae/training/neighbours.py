@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from psfdae.base.errors import Error
+from psfdae.image.image import Image
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut_image
 from psfdae.methods.field import FieldMixture
@@ -88,7 +89,7 @@ def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars
         update={"neighbour_ratio": neighbour_ratio}
     )
     settings = stars.settings.model_copy(update={"calibration_stars": calibration})
-    assert observation.positions is not None
+    assert isinstance(observation, Image)  # with neighbours on it
     for _ in range(2 if accepted_ratio > neighbour_ratio else 1):
         # A field from the stars so far, photometry of all stars with it, and a new choice of
         # bright stars in the cleaned image.

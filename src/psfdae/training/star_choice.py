@@ -17,6 +17,7 @@ from psfdae.base.errors import keyword
 from psfdae.denoise.star_model import SCALE_TOLERANCE
 from psfdae.image.camera import other_instruments
 from psfdae.image.errors import ObservationError
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.selection import CalibrationStarsError, Candidates, Verdict, collect
@@ -247,13 +248,13 @@ def _largest_size(
     """
     sizes = []
     for observation, image_candidates in zip(observations, candidates, strict=True):
-        if observation.shape is not None and observation.positions is not None:
+        if isinstance(observation, Image):
             # Stars that are good in small stamps are not saturated; without such stars, all count
             # that are not wider than these.
             sky, position = observation.sky(), image_candidates.bright.position
             if len(position) < MIN_STARS_WITH_ERROR:
                 position = image_candidates.position[image_candidates.verdict != Verdict.EXTENDED]
-            size = measure_size(sky.flat, sky.bad, position)
+            size = measure_size(sky.signal, sky.bad, position)
             if size is not None and size.light_within(size.sides[-1]) < light_min:
                 raise CalibrationStarsError(
                     f"{observation.path}: no star: half of the light of its sources is within "
@@ -324,7 +325,7 @@ def require_one_camera(observations: Sequence[Observation]) -> None:
     """
     first = observations[0]
     for observation in observations if len(observations) > 1 else ():
-        if observation.shape is None:
+        if not isinstance(observation, Image):
             raise ObservationError(observation.path, "a cube of stamps; expected an image")
         # The pixel scale, then telescope, camera and filter of the headers.
         images = (first, observation)

@@ -16,18 +16,19 @@ from psfdae.base.files import Column, Product
 from psfdae.base.rng import stream
 from psfdae.base.settings import Noise
 from psfdae.base.types import QTable
+from psfdae.image.image import Image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.positions import list_offset
 from psfdae.image.selection import Candidates
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
-from psfdae.image.training_images import stack_all, star_grid, training_columns
 from psfdae.methods.interface import Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
 from psfdae.training.settings import Settings
 from psfdae.training.star_sets import split_stars, training_set
+from psfdae.training.training_images import stack_all, star_grid, training_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,7 @@ class ImageStars:
             "image": ", ".join(image.observation.path.name for image in self.images),
             "image_sha256": ", ".join(image.observation.sha256() for image in self.images),
         }
-        if observation.shape:
+        if isinstance(observation, Image):
             description["image_px"] = [*reversed(observation.shape)]
         if frames := observation.detector_frames:
             description["detector"] = frames
@@ -269,7 +270,7 @@ def join_stars(exposures: Sequence[ImageStars]) -> ImageStars:
     observation = replace(
         first.observation,
         path=Path(f"{first.observation.path} and {len(exposures) - 1} more"),
-        shape=tuple(map(max, zip(*(image.shape or () for image in observations), strict=True))),
+        shape=tuple(map(max, zip(*(image.shape for image in observations), strict=True))),
         header_cards=[card for image in observations for card in image.header_cards],
     )
     candidates = Candidates.concatenate([image.candidates for image in exposures])

@@ -375,7 +375,6 @@ def measure_image(
     flux, has_flag = np.array(table["flux"], float), np.array(table["flags"]) > 0
     brightest = np.sort(flux[~has_flag & (flux > 0)])[::-1][:20]
     shape = stars.observation.shape
-    assert shape is not None  # of an image
     return {
         "time": cards.get("DATE-OBS", cards.get("MJD-OBS", "")),
         "airmass": cards.get("AIRMASS", math.nan),

@@ -14,7 +14,8 @@ from psfdae.denoise import flux_model as module
 from psfdae.denoise.flux_model import FluxModel, robust_flux
 from psfdae.denoise.leading_modes import LeadingModes, compute_clipped_rms
 from psfdae.denoise.star_flux import Photometer
-from psfdae.image.stamps import StarFlag, border_pixels, cut, displacement, smooth_stamps
+from psfdae.image.sky import border_pixels
+from psfdae.image.stamps import StarFlag, cut, displacement, smooth_stamps
 from psfdae.stars.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)

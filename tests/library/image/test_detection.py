@@ -14,12 +14,13 @@ from scipy.spatial import cKDTree
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae.denoise.bundle import read_bundle
-from psfdae.image.camera import camera_values, sample_sky
-from psfdae.image.detection import Sky
+from psfdae.image.camera import camera_values
+from psfdae.image.detection import _smooth, find_sources, is_on_source
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
+from psfdae.image.sky import Sky, sample_sky
 from psfdae.training.settings import from_words
 from psfdae_paper.stages import simulate
 
@@ -72,7 +73,7 @@ def test_stars_are_found_where_they_are(field):
     assert stars.detections.numbers("BACKGROUND") == pytest.approx(300 / 1.6, rel=0.08)
     # What a list is judged by.
     column, row = np.rint(example.centroid.T).astype(int)
-    assert stars.sky().is_on_source(column, row, 2.0).mean() > 0.9
+    assert is_on_source(stars.sky(), column, row, 2.0).mean() > 0.9
 
 
 def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
@@ -83,14 +84,14 @@ def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
     shape, rng = x.shape, np.random.default_rng(1)
     nothing = np.zeros(shape, bool)
     sky = Sky(1e3 * np.sum(light, axis=0), np.full(shape, 7.0), np.ones(shape), nothing, np.nan)
-    stars = sky.stars(5.0)
+    stars = find_sources(sky, 5.0)
     measured = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
     distance, star = cKDTree(measured).query(place)
     assert len(measured) == 3 and sorted(star) == [0, 1, 2] and (distance < 0.02).all()
     assert sorted(stars["id"]) == [1, 2, 3]
     assert (stars["BACKGROUND"] == 7.0).all()
     assert stars["FLUX_ISO"] == pytest.approx(np.full(3, 1e3 * 2 * np.pi * 1.5**2), rel=0.02)
-    smooth, limit = replace(sky, flat=rng.normal(size=shape))._above(2.0)
+    smooth, limit = _smooth(replace(sky, signal=rng.normal(size=shape)), 2.0)
     assert smooth.std() == pytest.approx(limit[0, 0] / 2.0, rel=0.05)
 
 
@@ -100,7 +101,7 @@ def test_pixels_off_an_image_are_on_no_source():
     nothing = np.zeros(star.shape, bool)
     sky = Sky(star, 0.0 * star, np.ones(star.shape), nothing, np.nan)
     column, row = np.array([79, 80, 79, -1, 79, 5]), np.array([59, 59, 60, 59, -1, 5])
-    assert sky.is_on_source(column, row, 2.0).tolist() == [True, *[False] * 5]
+    assert is_on_source(sky, column, row, 2.0).tolist() == [True, *[False] * 5]
 
 
 def test_the_sky_is_sampled_evenly_over_the_rows(tmp_path):

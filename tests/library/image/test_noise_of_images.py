@@ -9,9 +9,9 @@ from scipy import ndimage
 
 import psfdae
 from image_training import few_draws
-from psfdae.image.detection import find_sky
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
+from psfdae.image.sky import subtract_sky
 from psfdae.image.sky_level import noise_correlation
 from small_field import CAMERA, GAIN, READ, SKY, drawn, field, moffat, table
 
@@ -190,7 +190,7 @@ def test_stars_of_whole_counts_are_used_and_measured(image, options):
 @pytest.mark.parametrize("photons", [4.0, 1.0, 0.5])
 def test_photons_of_a_faint_sky_have_poisson_noise(photons):
     counts = np.random.default_rng(5).poisson(photons, (300, 300)).astype(np.float64)
-    sky = find_sky(counts, np.zeros(counts.shape, bool))
+    sky = subtract_sky(counts, np.zeros(counts.shape, bool))
     assert np.median(sky.noise) == pytest.approx(np.sqrt(photons), rel=0.15)
 
 
@@ -204,7 +204,7 @@ def test_offsets_of_rows_or_columns_are_in_the_noise_of_stars(axis, offset):
     rng = np.random.default_rng(4)
     shape = (1, 300) if axis else (300, 1)
     noise = rng.normal(0, 10.0, (300, 300)) + rng.normal(0, 10.0 * offset, shape)
-    sky = find_sky(200.0 + noise, np.zeros(noise.shape, bool))
+    sky = subtract_sky(200.0 + noise, np.zeros(noise.shape, bool))
     assert any("rows or columns" in note for note in sky.notes)
     assert sky.structure[:2] == ([], [])
     # A PSF with a FWHM of 3 px on many noises: Σ p n over Σ p² is the flux of a star.

@@ -12,12 +12,13 @@ import psfdae
 from command_line import refused
 from psfdae.api import Stars
 from psfdae.image import bad_pixels
-from psfdae.image.detection import find_sky
+from psfdae.image.detection import find_sources
 from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.interpolation import fill_bad, fill_bad_stamps
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict, fill_bad_pixels
+from psfdae.image.sky import subtract_sky
 from psfdae.image.sky_level import (
     SkyStructure,
     _smooth_meshes,
@@ -220,13 +221,13 @@ def test_outside_of_an_image_circle_nothing_is_exposed(clean, kind, sky):
     assert (part[~found.mask] > dimmest).mean() > share
     assert found.mask[is_bright].mean() < 0.2
     # Level and noise of the sky are right up to the edge.
-    measured = find_sky(image, found.mask)
+    measured = subtract_sky(image, found.mask)
     at = is_bright & ~found.mask
     sigma = np.sqrt(1.5 * sky + 25) / 1.5
     assert np.abs(measured.level - bias - sky)[at].mean() < 0.25 * sigma
     assert 0.9 < np.median(measured.noise[at]) / sigma < 1.15
     # Stars are found, and nothing else; those at the edge, of which a part is cut off, are flagged.
-    sources, whole = measured.stars(5.0), ~ndimage.binary_dilation(found.mask, iterations=4)
+    sources, whole = find_sources(measured, 5.0), ~ndimage.binary_dilation(found.mask, iterations=4)
     place = np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1) - 1.0
     true, seen = (p[whole[tuple(np.rint(p).astype(int).T[::-1])]] for p in (clean[1], place))
     assert (cKDTree(place).query(true)[0] < 1.5).mean() > 0.95
@@ -256,7 +257,9 @@ def test_a_known_structure_of_the_sky_is_used_again():
     wave[(np.maximum(np.abs(row - 256), np.abs(column - 256)) > 64)] = 0.0
     image = SKY + wave + np.random.default_rng(2).normal(0, 15, wave.shape)
     bad, middle = np.zeros(wave.shape, bool), np.s_[220:290, 220:290]
-    unknown, known = (find_sky(image, bad, structure=s) for s in (None, SkyStructure(is_fine=True)))
+    unknown, known = (
+        subtract_sky(image, bad, structure=s) for s in (None, SkyStructure(is_fine=True))
+    )
     assert not unknown.structure.is_fine and known.structure.is_fine
     assert (
         np.std((unknown.level - wave)[middle]) > 50.0 > 20.0 > np.std((known.level - wave)[middle])
@@ -335,9 +338,9 @@ def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
     image, place, _ = clean
     row, column = np.indices(image.shape) - SIDE / 2
     halo = 3000.0 / (1 + np.hypot(row, column) ** 2 / 400)
-    sky = find_sky(image + halo, np.zeros(image.shape, bool))
+    sky = subtract_sky(image + halo, np.zeros(image.shape, bool))
     assert "structure within 64 px" in sky.notes[0]
-    stars = sky.stars(5.0)
+    stars = find_sources(sky, 5.0)
     sources = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
     assert (cKDTree(sources).query(place)[0] < 1).mean() > 0.9
     assert (cKDTree(place).query(sources)[0] > 2).sum() < 5
@@ -538,7 +541,7 @@ def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):
     bad = np.zeros(image.shape, bool)
     column, row = np.rint(place).astype(int).T
     bad[row, column] = True
-    sources = find_sky(np.where(bad, np.nan, image), bad).stars(5.0)
+    sources = find_sources(subtract_sky(np.where(bad, np.nan, image), bad), 5.0)
     centres = np.stack([sources["X_IMAGE"], sources["Y_IMAGE"]], axis=1) - 1
     distance, index = cKDTree(centres).query(place)
     assert len(centres) == len(place) == len(set(index)) and distance.max() < 0.5

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from psfdae.base.rng import stream
-from psfdae.image.stamps import cut, sky_around
+from psfdae.image.sky import sky_around
+from psfdae.image.stamps import cut
 from psfdae.image.star_criteria import brightest_pixels, find_crowded, misfit, stamp_snr
-from psfdae.image.training_images import compute_bins, make_images, stack_parts, star_grid
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import find_centroids, shift_stamps
 from psfdae.stars.noise import NoiseModel, noise_equivalent_px
 from psfdae.stars.splits import held_out_fields
+from psfdae.training.training_images import compute_bins, make_images, stack_parts, star_grid
 
 FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
 

@@ -28,7 +28,6 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
-from psfdae.image.training_images import make_images, star_grid, training_columns
 from psfdae.methods import list_groups, method
 from psfdae.report.validation import Report
 from psfdae.stars.bright_stars import BrightStars
@@ -37,6 +36,7 @@ from psfdae.stars.noise import NoiseModel, OwnNoise
 from psfdae.stars.splits import held_out_fields
 from psfdae.training.settings import from_words
 from psfdae.training.star_sets import split_stars
+from psfdae.training.training_images import make_images, star_grid, training_columns
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import simulate
 from psfdae_paper.stars.example import FieldRecipe, example_field, star_images

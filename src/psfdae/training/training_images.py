@@ -74,8 +74,8 @@ def compute_bins(position: np.ndarray, bins: int) -> np.ndarray:
         return np.zeros(len(position), dtype=np.int64)
     # Position relative to the range of all positions, 0 … 1, along both axes.
     low, high = position.min(axis=0), position.max(axis=0)
-    share = (position - low) / np.where(high > low, high - low, 1.0)
-    bin_index = np.minimum((share * bins).astype(np.int64), bins - 1)
+    fraction = (position - low) / np.where(high > low, high - low, 1.0)
+    bin_index = np.minimum((fraction * bins).astype(np.int64), bins - 1)
     return np.asarray(bin_index[:, 0] + bins * bin_index[:, 1])
 
 
@@ -164,7 +164,7 @@ def make_images(
     jitter : ndarray of int, shape (n, 2)
         Centring error (row, column) in pixels.
     phase : ndarray, shape (n, 2)
-        Part of a pixel (row, column) by which the star was moved.
+        Fraction of a pixel (row, column) by which the star was moved.
     """
     # All draws come first, so that images do not depend on the size of the chunks.
     side = framing.stamp_px

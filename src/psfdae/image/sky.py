@@ -1,0 +1,298 @@
+"""The sky of images and stamps: its level and noise, and its subtraction.
+
+| of | by | result |
+|---|---|---|
+| an image in memory | `subtract_sky` | `Sky`: level and noise in each pixel, the image without it |
+| an image on the disk | `sample_sky` | `SkySample`: one level and noise, from squares |
+| stamps with a margin | `sky_around` | level and noise around each star |
+| stamps without a margin | `border_median`, `border_scatter` | level and noise in their border |
+
+`psfdae.image.sky_level` has the algorithm by which level and noise of each pixel are measured.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+
+import numpy as np
+import scipy
+
+from psfdae.image.fits_file import ImageFile, open_pixels
+from psfdae.image.interpolation import fill_bad
+from psfdae.image.sky_level import SkyLevel, SkyStructure, noise_correlation, sky_level
+from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
+
+
+@dataclass(frozen=True)
+class Sky:
+    """An image (h, w) with its sky subtracted, and the sky, in single precision.
+
+    Attributes
+    ----------
+    signal : ndarray, shape (h, w)
+        Image minus its sky; interpolated where bad, 0 where no good pixel is near.
+    level, noise : ndarray, shape (h, w)
+        Level of the sky, and σ of each pixel.
+    bad : ndarray of bool, shape (h, w)
+        Pixels to ignore.
+    noise_scale : float
+        Factor of the map of σ, NaN without one.
+    structure : SkyStructure
+        Steps of the sky's level and of its pixels.
+    notes : tuple of str
+        Sentences on unusual properties of the sky.
+    """
+
+    signal: np.ndarray
+    level: np.ndarray
+    noise: np.ndarray
+    bad: np.ndarray
+    noise_scale: float
+    structure: SkyStructure = field(default_factory=SkyStructure)
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def holes(self) -> np.ndarray:
+        """Bad pixels (h, w) of which more than half of the 5 × 5 pixels around are bad, too.
+
+        Other bad pixels are interpolated, so that a star with one of these is one source.
+        """
+        if not self.bad.any():
+            return self.bad
+        # Part of the 5 × 5 pixels that is bad.
+        around = scipy.ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
+        return np.asarray(self.bad & (around > 0.5))
+
+
+def subtract_sky(
+    image: np.ndarray,
+    bad: np.ndarray,
+    sigma: np.ndarray | None = None,
+    least_noise: float = 0.0,
+    known_sky: SkyLevel | None = None,
+    structure: SkyStructure | None = None,
+) -> Sky:
+    """Subtract the sky of an image; return the image with its sky.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+        Image, in any unit.
+    bad : ndarray of bool, shape (h, w)
+        Pixels to ignore.
+    sigma : ndarray, shape (h, w), optional
+        σ of every pixel but for a factor, which is fitted here.
+    least_noise : float
+        Lower limit of the noise, in the unit of the image.
+    known_sky : SkyLevel, optional
+        Sky of the image, if it was measured before.
+    structure : SkyStructure, optional
+        Structure of the sky, if it is known from the image with its stars.
+
+    Raises
+    ------
+    ValueError
+        If no mesh has enough good pixels.
+    """
+    # Level and noise from the good pixels.
+    image = np.where(bad, 0.0, image)
+    sky = sky_level(image, bad, structure) if known_sky is None else known_sky
+    level, noise, structure, notes = sky
+    # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
+    least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
+    noise = np.maximum(noise, least_noise, out=noise)
+    # A map of σ is scaled so that its median equals the median of the measured noise.
+    scale = np.nan
+    if sigma is not None:
+        scale = float(np.median(noise[~bad] / sigma[~bad]))
+        # Bad pixels, for which the map may lack σ, keep the noise of the sky around.
+        noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
+    signal = fill_bad((image - level).astype(np.float32), bad)[0]
+    return Sky(signal, level, noise, bad, scale, structure, notes)
+
+
+@dataclass(frozen=True)
+class SkySample:
+    """Sky of an image from squares spread over it, in the image's unit.
+
+    Attributes
+    ----------
+    level, noise : float
+        Median over the squares of their median and of their scatter, σ by the median deviation
+        and, where pixels share their noise, the scatter of sums of pixels.
+    highest : float
+        Largest pixel of all squares.
+    correlation : float
+        Ratio of the noise of sums of pixels to the noise of sums of independent ones, at least 1.
+    checker : float
+        Level of the pixels of even rows and columns and of odd ones, less the level of the others,
+        in units of the noise: the contrast of a chessboard.
+    """
+
+    level: float
+    noise: float
+    highest: float
+    correlation: float
+    checker: float
+
+
+def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
+    """Measure the sky in squares of at most 32 bands of rows; None if no square shows noise.
+
+    Squares of one value, such as an area without data, are ignored.
+
+    Parameters
+    ----------
+    image : ImageFile
+        Image (h, w) whose pixels are read.
+    square_px : int
+        Side of the squares in which sky and noise are measured.
+    """
+    rows, columns = image.shape
+    # Bands of rows, evenly spread over the image.
+    last_row = max(rows - square_px, 0)
+    count = min(32, -(-rows // square_px))
+    starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
+    levels, noises, highest = [], [], -np.inf
+    # Deviations from the sky in σ, band below band, with four rows without values between them.
+    deviations = np.full((len(starts), square_px + 4, columns), np.nan)
+    with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
+        for start, deviation in zip(starts, deviations, strict=True):
+            band = pixels[start : start + square_px]
+            band = np.where(np.isfinite(band), band, np.nan)
+            highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
+            # Medians of whole counts become the medians of the counts before rounding.
+            band, dither_variance = dither(band, count_step(band))
+            for column in range(0, columns, square_px):
+                square = band[:, column : column + square_px]
+                values = square[np.isfinite(square)]
+                if values.size < square_px:
+                    continue
+                # Stars in a square hardly change its median and its median deviation.
+                level = float(np.median(values))
+                noise = float(remove_dither(robust_scatter(values), dither_variance))
+                if noise > 0:
+                    deviation[: len(band), column : column + square_px] = (square - level) / noise
+                    levels.append(level)
+                    noises.append(noise)
+    if not levels:
+        return None
+    # Bands begin at even rows. Stars are clipped at 3 σ; medians would be equal for most whole
+    # counts.
+    bands = deviations.reshape(-1, columns)
+    is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
+    white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
+    checker = float(np.nanmean(white) - np.nanmean(black))
+    # Resampled pixels share noise: sums of them scatter by more than independent ones.
+    correlation = noise_correlation(bands)
+    noise = correlation * float(np.median(noises))
+    return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
+
+
+# Stamps: the sky in their border, and around them.
+
+
+@cache
+def border_pixels(side: int) -> np.ndarray:
+    """Return the flat indices of the ring at the edge of a stamp, an eighth of its side wide."""
+    width = max(1, side // 8)
+    border = np.ones((side, side), dtype=bool)
+    border[width:-width, width:-width] = False
+    return np.flatnonzero(border)
+
+
+def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return the median of the good pixels in the border of every stamp (n, s, s).
+
+    Returns
+    -------
+    ndarray, shape (n,), float64
+        Median of all good pixels if the border has no good pixel; 0 if no pixel is good.
+    """
+    size = (len(stamps), stamps.shape[-1] ** 2)
+    flat, hidden = stamps.reshape(size), bad.reshape(size)
+    ring = border_pixels(stamps.shape[-1])
+    # All stamps at once, then those with bad pixels one by one.
+    median = np.median(flat[:, ring], axis=1).astype(np.float64)
+    for star in np.flatnonzero(hidden.any(axis=1)):
+        good = flat[star, ring][~hidden[star, ring]]
+        good = good if good.size else flat[star][~hidden[star]]
+        median[star] = np.median(good) if good.size else 0.0
+    return median
+
+
+def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
+    """Return σ of the pixels in the border of every stamp from their median deviation.
+
+    Light of the star in the border increases it.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, s, s)
+        Stamps, with or without sky.
+    bad : ndarray of bool, shape (n, s, s), optional
+        Pixels that are left out, unless all are bad.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        σ of each stamp.
+    """
+    from astropy.stats import mad_std
+
+    size = (len(stamps), stamps.shape[-1] ** 2)
+    border = border_pixels(stamps.shape[-1])
+    ring = stamps.reshape(size)[:, border]
+    if bad is None:
+        return np.asarray(mad_std(ring, axis=1), np.float64)
+    # Bad pixels of the ring are left out, unless the whole ring is bad.
+    hidden = bad.reshape(size)[:, border]
+    hidden &= ~hidden.all(axis=1, keepdims=True)
+    ring = np.where(hidden, np.nan, ring)
+    return np.asarray(mad_std(ring, axis=1, ignore_nan=True), np.float64)
+
+
+def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return median and scatter of the pixels outside the stamps, other stars clipped.
+
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of the stamp itself,
+    in which light of the star is taken for sky.
+
+    Parameters
+    ----------
+    window : ndarray, shape (n, s, s)
+        Stamps with their margins.
+    bad : ndarray of bool, shape (n, s, s)
+        Pixels that are ignored.
+    stamp_px : int
+        Side d of the stamps.
+
+    Returns
+    -------
+    level, noise : ndarray, shape (n,)
+        Median and σ, in counts per pixel; 0 where all pixels are bad.
+    """
+    from astropy.stats import sigma_clipped_stats
+
+    # The ring around the stamp.
+    side = window.shape[-1]
+    hole_px = stamp_px if side >= stamp_px + 4 else side - 4
+    start = side // 2 - hole_px // 2
+    ring = np.ones((side, side), dtype=bool)
+    ring[start : start + hole_px, start : start + hole_px] = False
+    # Dither whole counts, so that medians are not rounded.
+    step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
+    window, dither_variance = dither(window, step)
+    # Pixels of the ring more than 3 σ off their median belong to other stars.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
+        _, level, noise = sigma_clipped_stats(
+            window[:, ring], mask=bad[:, ring], sigma=3.0, stdfunc="mad_std", axis=1
+        )
+    # If all pixels of all stamps are bad, both are one masked value; bad stamps get 0.
+    statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
+    statistics = np.nan_to_num(statistics).astype(float)
+    level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
+    return level, np.where(noise > 0, remove_dither(noise, dither_variance), 0.0)
