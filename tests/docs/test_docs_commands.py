@@ -41,11 +41,11 @@ DRY = {
         for words in ("best SET=$(psfdae paper best dae_width)", "lr2e-3 SET=train.lr=2e-3")
     ),
     "make report RESULTS=results/lr2e-3 TARGETS=dataset3",
-    "make mlflow RESULTS=results/lr2e-3",
     *(f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")),
     *(f"make {t}" for t in ("benchmark", "stability", "bounds", "report")),
     "snakemake night --config images=night/*.fits",
     *(f"snakemake sweep --cores all --config sweep={s}" for s in ("dae_width", "network_epochs")),
+    "snakemake experiment --cores all --config name=mine",
     "snakemake tracking --forcerun track track_alignment",
     *(f"make {t}" for t in ("mlflow", "mlflow PORT=5001", "reference")),
     *(f"make test{t}" for t in ("", "-all", "-docs", "-pythons")),

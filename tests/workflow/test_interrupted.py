@@ -6,14 +6,27 @@ types the same again. What comes out is compared byte by byte with an undisturbe
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import subprocess
 import time
 
+import pandas as pd
 import psutil
 import pytest
 
-from workflow_runs import KERNELS, NO_CLUSTER, PATH, QUIET, captured, clone
+from psfdae.base.files import write_text
+from workflow_runs import (
+    KERNELS,
+    NO_CLUSTER,
+    PATH,
+    QUIET,
+    captured,
+    clone,
+    copy_of_sources,
+    wait_until,
+)
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -94,3 +107,65 @@ def test_a_killed_process(half_done, undisturbed, victim):
         assert "resuming after epoch" in log.read_text()
     else:
         assert "waiting for it to end" in output
+
+
+# An experiment
+
+EXPERIMENT = """
+preset: smoke
+datasets: [dataset3, dataset7]
+overrides:
+  dataset.splits: [random]
+  dataset.references: [realisation]
+  methods: [noisy, lmmse, dae]
+settings:
+  paper: {}
+  read_noise: {noise.law: gaussian}
+  small: {framing.stamp_px: 14}
+seeds: [1, 2, 3]
+"""
+
+
+def run_experiment(folder, *words):
+    """Arguments of `subprocess` for the target experiment."""
+    environment = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src")}
+    line = ["snakemake", "experiment", *words, "--config", "name=mine"]
+    return {"args": line, "cwd": folder, "env": environment | NO_CLUSTER | KERNELS}
+
+
+def experiment_results(folder):
+    """Content of the table, its Markdown, the figure and all products, by name."""
+    endings = (".md", ".png", ".csv", ".h5", ".safetensors", ".parquet")
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted((folder / RESULTS).rglob("*"))
+        if path.suffix in endings and path.name != "history.csv"
+    }
+
+
+def test_a_killed_experiment_ends_in_the_same_files(tmp_path):
+    """Three settings, three seeds and two datasets; all processes are killed at once."""
+    folders = [copy_of_sources(tmp_path / name) for name in ("undisturbed", "killed")]
+    for folder in folders:
+        write_text(folder / "config/experiment/mine.yaml", EXPERIMENT)
+    run = captured(**run_experiment(folders[0], "--cores", "1"))
+    assert run.returncode == 0, run.stdout + run.stderr
+    table = pd.read_csv(folders[0] / RESULTS / "experiments/mine/errors.csv")
+    # 4 metrics of 3 methods at 4 levels, by 3 settings of 2 datasets.
+    assert len(table) == 4 * 3 * 4 * 3 * 2
+    assert (table.seeds == 3).all()
+    assert table[["value", "stderr", "ratio", "ratio_stderr"]].notna().all().all()
+    second = subprocess.Popen(
+        **run_experiment(folders[1], "--cores", "1"), **QUIET, start_new_session=True
+    )
+    evaluations = folders[1] / RESULTS / "evaluation"
+    wait_until(lambda: len([*evaluations.rglob("*.csv")]) >= 4, 600, "no evaluation")
+    os.killpg(second.pid, signal.SIGKILL)
+    second.wait()
+    assert len([*evaluations.rglob("*.csv")]) < 18
+    for words in (["--unlock"], []):
+        again = captured(**run_experiment(folders[1], "--cores", "1", *words))
+        assert again.returncode == 0, again.stdout + again.stderr
+    expected = experiment_results(folders[0])
+    assert len(expected) > 18 * 4
+    assert experiment_results(folders[1]) == expected

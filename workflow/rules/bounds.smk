@@ -5,12 +5,12 @@ rule bank:
         f"{RESULTS}/logs/bounds/bank_{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/bank-{{stars}}.tsv"
-    threads: lambda w: compose_choice(RUN, datasets.stars_choice(w.stars))["bounds"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.stars_choice(RUN, w.stars))["bounds"]["threads"]
     resources:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: settings(RUN, "bank", datasets.stars_choice(w.stars)),
+        config=lambda w: settings(RUN, "bank", datasets.stars_choice(RUN, w.stars)),
         source=hash_code("bank"),
     message:
         "Simulating the bank of {wildcards.stars}"
@@ -21,9 +21,7 @@ rule bank:
 rule dataset_bounds:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
-        templates=lambda w: datasets.templates_file(
-            RUN, load_dataset_config(RUN, w.dataset).stars.name
-        ),
+        templates=lambda w: datasets.templates_file(RUN, w.dataset),
         bank=lambda w: bounds.bank_files(RUN, w.dataset),
     output:
         summary=f"{RESULTS}/bounds/{{dataset}}.csv",

@@ -5,9 +5,9 @@ rule templates:
         f"{RESULTS}/logs/templates/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/templates/{{scene}}.tsv"
-    threads: lambda w: compose_choice(RUN, datasets.scene_choice(w.scene))["optics"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.scene_choice(RUN, w.scene))["optics"]["threads"]
     params:
-        config=lambda w: settings(RUN, "templates", datasets.scene_choice(w.scene)),
+        config=lambda w: settings(RUN, "templates", datasets.scene_choice(RUN, w.scene)),
         source=hash_code("templates"),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
@@ -17,19 +17,19 @@ rule templates:
 
 rule stars:
     input:
-        templates=lambda w: datasets.templates_file(RUN, w.stars),
+        templates=rules.templates.output,
     output:
         f"{RESULTS}/data/{{scene}}/{{stars}}.h5",
     log:
         f"{RESULTS}/logs/stars/{{scene}}/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/stars/{{scene}}/{{stars}}.tsv"
-    threads: lambda w: compose_choice(RUN, datasets.scene_choice(w.scene))["optics"]["threads"]
+    threads: lambda w: compose_choice(RUN, datasets.scene_choice(RUN, w.scene))["optics"]["threads"]
     resources:
         mem_mb=1000,
         runtime=30,
     params:
-        config=lambda w: settings(RUN, "stars", datasets.stars_choice(w.stars)),
+        config=lambda w: settings(RUN, "stars", datasets.stars_choice(RUN, w.stars)),
         source=hash_code("stars"),
     message:
         "Simulating the noise-free stars {wildcards.stars}"

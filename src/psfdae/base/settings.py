@@ -13,7 +13,15 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from psfdae.base.errors import Error, did_you_mean
 
@@ -129,14 +137,14 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     The list can be pasted as a command line. A rule of the workflow runs again when it changes:
     the same configuration gives the same text, whatever its comments and number formats.
     """
+    return [f"++{key}={as_literal(value)}" for key, value in sorted(leaves(tree))]
 
-    # Lists without spaces and quotes, as Hydra reads them.
-    def literal(value: Any) -> str:
-        if isinstance(value, list):
-            return "[" + ",".join(map(literal, value)) + "]"
-        return value if isinstance(value, str) else json.dumps(value)
 
-    return [f"++{key}={literal(value)}" for key, value in sorted(leaves(tree))]
+def as_literal(value: Any) -> str:
+    """Return the text of a value in an override; lists are without spaces and quotes."""
+    if isinstance(value, list):
+        return "[" + ",".join(map(as_literal, value)) + "]"
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
@@ -163,8 +171,21 @@ class Stamp(Group):
     """Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars."""
 
 
+NoiseLaw = Literal["poisson", "gaussian", "detector", "correlated"]
+
+NOISE_KEYS: Mapping[str, tuple[str, ...]] = {
+    "detector": ("read_noise_e", "gain_e"),
+    "correlated": ("shift_px",),
+}
+"""Keys of the group `noise` that only one noise law has; they are 0 for all other laws."""
+
+
 class Noise(Group):
-    """Noise band: the levels λ that one dataset mixes."""
+    """Noise band: the levels λ that one dataset mixes, and the noise law.
+
+    The laws are classes of `psfdae.stars.noise`. Keys that the law does not have are not part of
+    the dumped settings, nor is the law itself if it is the paper's, Poisson noise.
+    """
 
     name: Name
     """Name in titles and messages."""
@@ -174,6 +195,54 @@ class Noise(Group):
     """Pixel RMS of the normalised image per unit of λ."""
     background_photons: Annotated[float, Field(gt=0, le=1e12)]
     """Sky photons per pixel."""
+    law: NoiseLaw = "poisson"
+    """Noise law: photons of star and sky, Gaussian noise, a detector, or interpolated pixels."""
+    read_noise_e: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Law detector: RMS of the read noise in electrons."""
+    gain_e: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Law detector: electrons per count, to which images are rounded; 0: not rounded."""
+    shift_px: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Law correlated: shift in pixels, per axis, by which pixels were interpolated linearly."""
+
+    @model_validator(mode="after")
+    def check_law(self) -> Noise:
+        """Require the keys of the law, and no keys of other laws.
+
+        Raises
+        ------
+        ValueError
+            With the key and the law that has it.
+        """
+        for law, keys in NOISE_KEYS.items():
+            positive_keys = [key for key in keys if getattr(self, key)]
+            if law == self.law and not positive_keys:
+                raise ValueError(f"law = {law}: needs {' or '.join(keys)} above 0")
+            if law != self.law and positive_keys:
+                key, value = positive_keys[0], getattr(self, positive_keys[0])
+                raise ValueError(
+                    f"{key} = {value:g}: law {self.law} does not have it, law {law} has"
+                )
+        # Rounding adds noise of RMS gain_e / √12 that is independent of the star only if steps are
+        # not much wider than the noise before it.
+        coarsest_e = 2.0 * (self.background_photons + self.read_noise_e**2) ** 0.5
+        if self.gain_e > coarsest_e:
+            raise ValueError(
+                f"gain_e = {self.gain_e:g}: must be at most {coarsest_e:.3g}, twice the noise of "
+                "sky and read noise in electrons; coarser steps depend on the star"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def dump_law(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the settings without the keys of other laws."""
+        hidden_keys = {key for law, keys in NOISE_KEYS.items() if law != self.law for key in keys}
+        hidden_keys |= {"law"} if self.law == "poisson" else set()
+        return {key: value for key, value in dump(self).items() if key not in hidden_keys}
+
+    def require_poisson(self, subject: str) -> None:
+        """Raise ConfigError if the law is not Poisson noise; `subject` begins the message."""
+        if self.law != "poisson":
+            raise ConfigError(f"{subject} for Poisson noise only, not for noise.law = {self.law}")
 
 
 class Parts(Group):

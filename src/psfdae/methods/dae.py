@@ -97,7 +97,7 @@ class Dae(Method):
 
         # Everything that determines the result: settings, seed, noise, and the stars themselves.
         decisions = {"dae": dump_deciding(dae), "train": dump_deciding(train), "seed": data.seed}
-        decisions["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        decisions["noise"] = [data.levels.tolist(), str(data.noise)]
         # Positions are not included: a network uses only the images.
         arrays = [data.images, data.references, data.fit, data.validation]
         # Warm start: the network begins with the weights of a network with the same layers.

@@ -31,7 +31,7 @@ from psfdae.methods.mixture.densities import cluster_weights, star_batches
 from psfdae.methods.mixture.fit import best_on_validation, k_means, mixture_arrays
 from psfdae.methods.mixture.posterior import flux_factor, posterior_mean
 from psfdae.methods.mixture.prior import MixturePrior
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.noise import build_noise
 
 
 class Gmm(Group):
@@ -69,6 +69,7 @@ class GaussianMixture(MixturePrior, Method):
 
     look = Look("GMM", "#cc79a7", "P", title="Gaussian mixture")
     needs = Needs(level=True, memory_mb=1200)
+    assumes_independent_pixels = True
     storage = Storage(
         arrays={
             "axes": ("1", "eigenvectors of the covariance within clusters, columns"),
@@ -171,7 +172,7 @@ class GaussianMixture(MixturePrior, Method):
     ) -> Self:
         """Return a fit from its arrays, with the noise of the configuration."""
         # A bundle may have the deviations in half precision.
-        noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
+        noise = build_noise(config["noise"])
         fields: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
         return cls(**fields, noise=noise)
 

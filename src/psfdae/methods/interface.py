@@ -287,6 +287,9 @@ class Method:
         True if it has a model of the PSF at every position in the field, with which it measures
         flux, sky and centre of a star together with its PSF. It has `measure`, `psf_at`, `order`
         and `draw_stars`, and is trained on `TrainingSet.bright`.
+    assumes_independent_pixels : bool
+        True if its likelihood is a product over pixels. With the noise of interpolated pixels its
+        PSFs are not the best possible, and its standard deviations do not hold.
     finds_flux : bool
         True if its form `free_flux` measures the flux of an image for which only an estimate is
         known. It has `flux`.
@@ -300,6 +303,7 @@ class Method:
     groups: ClassVar[Mapping[str, type[Group]]] = {}
     knows_field: ClassVar[bool] = False
     finds_flux: ClassVar[bool] = False
+    assumes_independent_pixels: ClassVar[bool] = False
 
     def __repr__(self) -> str:
         """Return the class with the title of the method."""

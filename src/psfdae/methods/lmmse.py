@@ -1,8 +1,8 @@
 """Linear minimum-mean-square-error estimator with known noise level: an oracle.
 
 ŷ = ȳ + C_yx (C_xx + N)⁻¹ (x − x̄) with the mean and the (cross-)covariance of the
-noise-free training stars and their references, and the noise variance for the given
-λ of the star on the diagonal of N.
+noise-free training stars and their references, and the covariance N of the noise for the
+given λ of the star, which is diagonal unless pixels were interpolated.
 """
 
 from __future__ import annotations
@@ -63,8 +63,7 @@ class LinearMmse(Method):
         """Return estimates for noisy images of one noise level λ, shape (n, d, d)."""
         # N: the noise of the mean star; then the gain C_yx (C_xx + N)⁻¹, whose transpose is the
         # solution of a linear system, as C_xx + N is symmetric.
-        variance = self.noise.variance(self.mean_x, level)
-        system = self.cov_xx + np.diag(variance)
+        system = self.cov_xx + self.noise.covariance(self.mean_x, level)
         gain = np.linalg.solve(system, self.cov_yx.T).T
         # ŷ = ȳ + gain (x − x̄), an image in each row.
         residual = noisy.reshape(len(noisy), -1) - self.mean_x

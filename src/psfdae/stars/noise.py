@@ -1,4 +1,4 @@
-"""Photon noise of a star on a bright sky.
+"""Noise of a star on a bright sky, by several noise laws.
 
 Inputs: noise-free PSFs of sum 1, (n, d, d), and noise levels. Outputs: variances of pixels and
 noisy images; for bright stars, the contribution of noise to the scatter of their images.
@@ -9,13 +9,17 @@ sky of B photons per pixel gives exactly that,
 
     n ~ Poisson(F p + B),   image = (n − B) / F,   F = √B / (κ λ),
 
-with variance (κλ)² + p/F: the star's own photons are included.
+with variance (κλ)² + p/F: the star's own photons are included. This is `NoiseModel`, the paper's
+law. In all other laws of `LAWS`, too, κλ is the RMS of a pixel of the sky over the flux, so that
+levels of different laws are comparable.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,7 +38,11 @@ class NoiseModel:
         Pixel RMS of the normalised image per unit of λ.
     background : float
         Sky level B in photons per pixel.
+    has_independent_pixels : bool
+        False if the noise of a pixel is correlated with its neighbours'.
     """
+
+    has_independent_pixels: ClassVar[bool] = True
 
     kappa: float
     background: float
@@ -49,6 +57,10 @@ class NoiseModel:
         """Return the pixel variance of a normalised image; `level` broadcasts against `psf`."""
         # σ² = (κλ)² + p/F.
         return np.asarray((self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level))
+
+    def covariance(self, psf: np.ndarray, level: float) -> np.ndarray:
+        """Return the covariance of the pixels (P, P) of an image (P,) of a square stamp."""
+        return np.diag(self.variance(psf, level))
 
     def draw(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
@@ -89,6 +101,141 @@ class NoiseModel:
         noisy *= rng.standard_normal(psf.shape, dtype=np.float32)
         noisy += psf
         return noisy
+
+
+@dataclass(frozen=True)
+class GaussianNoise(NoiseModel):
+    """Gaussian noise of the same variance in all pixels, as of a detector's read noise.
+
+    image = p + κλ z with standard normal z. The star's photons add no noise: the law holds for
+    faint stars on a detector whose read noise √B, in electrons, exceeds the noise of the sky.
+    """
+
+    def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
+        """Return the pixel variance (κλ)² in the shape of `psf`."""
+        return np.broadcast_to((self.kappa * np.asarray(level)) ** 2, np.shape(psf))
+
+    def draw(
+        self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw noisy images as `NoiseModel.draw_gaussian`, which is exact for this law."""
+        return self.draw_gaussian(psf, level, rng)
+
+
+@dataclass(frozen=True)
+class DetectorNoise(NoiseModel):
+    """Photon noise of star and sky, Gaussian read noise, and rounding to whole counts.
+
+    The electrons of a pixel are n ~ Poisson(F p + B) + r z, and the image is
+    (g round(n / g) − B) / F with F = √(B + r² + g²/12) / (κ λ): the variance of a pixel is
+    (κλ)² + p/F, as of `NoiseModel`, with a brighter star for the same λ.
+
+    Attributes
+    ----------
+    read_noise_e : float
+        RMS r of the read noise in electrons.
+    gain_e : float
+        Electrons g per count; 0: images are not rounded.
+    """
+
+    read_noise_e: float
+    gain_e: float
+
+    def flux(self, level: np.ndarray | float) -> np.ndarray:
+        """Return the flux F in photons inside the stamp of a star of noise level λ."""
+        # Rounding to steps g has the variance g²/12 of a uniform error.
+        variance = self.background + self.read_noise_e**2 + self.gain_e**2 / 12.0
+        return np.asarray(np.sqrt(variance) / (self.kappa * np.asarray(level, np.float64)))
+
+    def draw(
+        self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw noisy images, sky-subtracted and normalised by the true flux, as `NoiseModel`."""
+        flux = _per_image(self.flux(level), psf)
+        electrons = rng.poisson(np.maximum(flux * psf + self.background, 0.0)).astype(np.float64)
+        electrons += self.read_noise_e * rng.standard_normal(psf.shape)
+        if self.gain_e:
+            electrons = self.gain_e * np.rint(electrons / self.gain_e)
+        return np.asarray((electrons - self.background) / flux, np.float32)
+
+
+@dataclass(frozen=True)
+class CorrelatedNoise(NoiseModel):
+    """Noise of pixels that were interpolated linearly to a grid shifted by s pixels per axis.
+
+    A pixel is (1 − s) a + s b of two neighbours along each axis, as in registered and stacked
+    images. Neighbours have the correlation ρ = s (1 − s) / ((1 − s)² + s²). Each pixel keeps the
+    variance of `NoiseModel` for its λ and its star; the star is not interpolated, because its PSF
+    in such images includes the interpolation.
+
+    Attributes
+    ----------
+    shift_px : float
+        Shift s, 0 to 0.5.
+    """
+
+    has_independent_pixels: ClassVar[bool] = False
+
+    shift_px: float
+
+    def covariance(self, psf: np.ndarray, level: float) -> np.ndarray:
+        """Return the covariance of the pixels (P, P) of an image (P,) of a square stamp."""
+        # Correlation along one axis; correlations along both axes multiply.
+        s, side = self.shift_px, round(psf.size**0.5)
+        rho = s * (1.0 - s) / ((1.0 - s) ** 2 + s**2)
+        along = np.eye(side) + rho * (np.eye(side, k=1) + np.eye(side, k=-1))
+        sigma = np.sqrt(self.variance(psf, level))
+        return np.asarray(np.kron(along, along) * sigma * sigma[:, None])
+
+    def draw(
+        self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw noisy images of stars (B, d, d) with correlated photon noise."""
+        # Photon noise of unit variance on a stamp with one more row and column.
+        wide_psf, levels = self._widen(psf), _per_image(level, psf)
+        error = super().draw(wide_psf, level, rng) - wide_psf
+        unit_noise = error / np.sqrt(self.variance(wide_psf, levels))
+        return self._add_noise(psf, levels, unit_noise)
+
+    def draw_gaussian(
+        self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Draw images as `draw` does, but with Gaussian noise of the same covariance."""
+        unit_noise = rng.standard_normal(self._widen(psf).shape, dtype=np.float32)
+        return self._add_noise(psf, _per_image(level, psf), unit_noise)
+
+    @staticmethod
+    def _widen(psf: np.ndarray) -> np.ndarray:
+        """Return stamps with one more row and column, equal to the last ones."""
+        return np.pad(psf, ((0, 0), (0, 1), (0, 1)), mode="edge")
+
+    def _add_noise(self, psf: np.ndarray, level: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return stars with interpolated noise, from noise of variance 1 on wider stamps."""
+        # Weights whose squares add up to 1 keep the variance.
+        s = self.shift_px
+        first, second = np.array([1.0 - s, s]) / np.hypot(1.0 - s, s)
+        noise = first * noise[:, :-1] + second * noise[:, 1:]
+        noise = first * noise[:, :, :-1] + second * noise[:, :, 1:]
+        return np.asarray(psf + np.sqrt(self.variance(psf, level)) * noise, np.float32)
+
+
+LAWS: Mapping[str, type[NoiseModel]] = {
+    "poisson": NoiseModel,
+    "gaussian": GaussianNoise,
+    "detector": DetectorNoise,
+    "correlated": CorrelatedNoise,
+}
+"""Classes of the noise laws by the key `noise.law`."""
+
+
+def build_noise(noise: Mapping[str, Any]) -> NoiseModel:
+    """Return the noise model of dumped settings `psfdae.base.settings.Noise`.
+
+    Files of earlier versions lack the law, which is Poisson noise.
+    """
+    law = LAWS[noise.get("law", "poisson")]
+    values = {**noise, "background": noise["background_photons"]}
+    return law(**{field.name: values[field.name] for field in fields(law)})
 
 
 def _per_image(values: np.ndarray | float, psf: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
 from psfdae.base.entry_points import find_entry_points
 from psfdae.base.errors import did_you_mean, keyword
@@ -72,6 +72,13 @@ class Settings(Group):
     noise: Noise = Noise(name="from_stars", levels=[1e-2], kappa=1.0, background_photons=1e4)
     parts: Parts = Parts()
     evaluation: Evaluation = Evaluation()
+
+    @field_validator("noise")
+    @classmethod
+    def check_noise(cls, noise: Noise) -> Noise:
+        """Require Poisson noise: its law gives the errors of stars of an image."""
+        noise.require_poisson("stars of an image have errors")
+        return noise
 
     @model_validator(mode="before")
     @classmethod

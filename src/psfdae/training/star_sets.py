@@ -18,7 +18,7 @@ from psfdae.base.settings import Config, OfFit, WithNoise
 from psfdae.methods.fit_files import get_training_reference
 from psfdae.methods.interface import Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars, places
-from psfdae.stars.noise import NoiseModel, OwnNoise, noise_equivalent_px
+from psfdae.stars.noise import NoiseModel, OwnNoise, build_noise, noise_equivalent_px
 from psfdae.stars.splits import Split, held_out_split, random_split
 
 
@@ -97,8 +97,8 @@ def split_stars(stars: Product, kind: str, config: OfFit) -> Split:
 
 
 def noise_model(config: WithNoise) -> NoiseModel:
-    """Return the noise model of a configuration."""
-    return NoiseModel(config.noise.kappa, config.noise.background_photons)
+    """Return the noise model of a configuration, by its noise law."""
+    return build_noise(config.noise.model_dump())
 
 
 def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: float) -> np.ndarray:

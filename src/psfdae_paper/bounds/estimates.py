@@ -69,7 +69,14 @@ class BoundedStars:
 
 
 def read_test_stars(config: Config, product: Product) -> BoundedStars:
-    """Read the first test stars of a product "stars", with the noise of their datasets."""
+    """Read the first test stars of a product "stars", with the noise of their datasets.
+
+    Raises
+    ------
+    ConfigError
+        If the noise is not Poisson noise, whose likelihood the bounds have.
+    """
+    config.noise.require_poisson("bounds hold")
     # Errors of bounds and methods are compared star by star: stars and noise are the same as in the
     # stage `evaluate`.
     star = split_stars(product, SPLIT, config).test[: config.bounds.test_stars]

@@ -204,6 +204,8 @@ def validate_tree(tree: Mapping[str, Any]) -> Config:
     if not _is_alignment(tree):
         return parse_settings(build_config_class(), tree)
     _require_known_groups(tree)
+    # Likelihoods and bounds of scene 3 are of Poisson noise.
+    part(("noise",), tree).noise.require_poisson("scene 3 is")
     reads = (
         *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
         *("cnn", "perceptron", *(f"train_{name}" for name in list_trained_networks())),
@@ -356,10 +358,8 @@ def write_settings(
 
     # Checked values in the order of the classes.
     settings = part(reads, select_stage_groups(reads, tree)).model_dump()
-    # The name is a hash of the decisive settings: another name makes Snakemake repeat a job.
-    settings_text = json.dumps(drop_neutral_settings(settings), sort_keys=True)
-    digest = hashlib.sha256(settings_text.encode()).hexdigest()
-    path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
+    # Another name makes Snakemake repeat a job.
+    path = folder / f"{stage.replace(' ', '-')}-{_hash_settings(settings)[:16]}.yaml"
     # A dry run writes nothing; jobs on other machines read the same file.
     if not dry:
         text = yaml.safe_dump(settings, sort_keys=True, allow_unicode=True)
@@ -367,6 +367,31 @@ def write_settings(
         if not (path.is_file() and path.read_bytes() == text.encode()):
             write_text(path, text)
     return path
+
+
+def hash_groups(reads: tuple[str, ...], tree: Mapping[str, Any]) -> str:
+    """Return the hash of the settings of some groups that can change a result, 64 digits.
+
+    Parameters
+    ----------
+    reads : tuple of str
+        Names of the groups.
+    tree : mapping
+        Composed configuration.
+
+    Raises
+    ------
+    ConfigError
+        Names each wrong key with its value and the allowed range.
+    """
+    # Checked values: 1 and 1.0 are the same number.
+    return _hash_settings(part(reads, select_stage_groups(reads, tree)).model_dump())
+
+
+def _hash_settings(settings: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the settings that can change a result."""
+    settings_text = json.dumps(drop_neutral_settings(settings), sort_keys=True)
+    return hashlib.sha256(settings_text.encode()).hexdigest()
 
 
 def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:

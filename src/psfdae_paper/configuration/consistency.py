@@ -13,15 +13,19 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict, ValidationError, create_model, model_validator
 
-from psfdae.base.settings import Group, leaves
+from psfdae.base.settings import Group
 from psfdae.telescope.settings import Telescope, has_own_aberrations
 from psfdae_paper.configuration.base import get_search_distance
+from psfdae_paper.configuration.wavefront import VonKarman
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
 
 STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
 """Groups that decide the static PSFs."""
+
+WAVEFRONT_KINDS = {"seidel": "seidel", "turbulence": "von_karman", "telescope": "telescope"}
+"""Kind of the wavefronts of each scene."""
 
 
 class Consistent(Group):
@@ -86,19 +90,34 @@ class Consistent(Group):
                 f"telescope = {name}: has no aberrations; scene = telescope needs a telescope "
                 "with the keys field_edge_deg and aberrations, such as example_zernike"
             )
+        # The kind of the wavefront decides which aberrations are simulated.
+        wavefront = groups.get("wavefront")
+        kind = wavefront.get("kind") if isinstance(wavefront, Mapping) else None
+        expected_kind = WAVEFRONT_KINDS.get(str(scene.get("name")))
+        if kind and expected_kind and kind != expected_kind:
+            raise ValueError(
+                f"scene.name = {scene.get('name')}: wavefront.kind must be {expected_kind}, "
+                f"not {kind}; a dataset takes both from a file of config/scene"
+            )
         return tree
 
     @model_validator(mode="after")
     def check_jitter(self) -> Consistent:
-        """Reject a jitter of aberrations for stars without random aberrations.
+        """Reject random aberrations where there are none, and a jitter of those that are 0.
 
         Raises
         ------
         ValueError
-            With both keys.
+            With the keys.
         """
         # Groups that a stage does not read are absent, and a telescope may lack aberrations.
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
+        wavefront = getattr(self, "wavefront", None)
+        if stars is not None and stars.aberration_fraction and isinstance(wavefront, VonKarman):
+            raise ValueError(
+                f"stars.aberration_fraction = {stars.aberration_fraction:g}: must be 0, stars of "
+                "scene turbulence have no random aberrations"
+            )
         # In waves RMS; own telescopes alone have it.
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
         if stars is None or not jitter:
@@ -178,34 +197,6 @@ def fill_derived_values(tree: Mapping[str, Any]) -> dict[str, Any]:
             intervals = max(points - 1, 1) if isinstance(points, int) else 2
             grid["spacing_deg"] = 2.0 * edge / intervals
     return groups
-
-
-def compare_simulations(
-    dataset: Mapping[str, Any], stars: Mapping[str, Any]
-) -> list[tuple[str, object, object]]:
-    """Return the simulation settings in which a dataset differs from the file of its stars.
-
-    The stars are simulated once, from their own file, for all datasets that choose them.
-
-    Parameters
-    ----------
-    dataset, stars : mapping
-        Composed configurations of the dataset and of the file in `config/stars`.
-
-    Returns
-    -------
-    list of (str, object, object)
-        Dotted key, its value in the dataset and in the file of the stars (None if it is absent).
-    """
-    values, simulated_values = (
-        dict(leaves({group: tree[group] for group in SIMULATION if group in tree}))
-        for tree in (dataset, stars)
-    )
-    return [
-        (key, values.get(key), simulated_values.get(key))
-        for key in dict.fromkeys([*values, *simulated_values])
-        if values.get(key) != simulated_values.get(key)
-    ]
 
 
 @cache

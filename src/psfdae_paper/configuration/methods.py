@@ -12,9 +12,10 @@ from pathlib import Path
 
 from psfdae.base.files import ProductError
 from psfdae.base.reading import parse_yaml
-from psfdae.base.settings import ConfigError
+from psfdae.base.settings import Config, ConfigError
 from psfdae.methods import all_methods, method
 from psfdae.methods.interface import Method
+from psfdae.stars.noise import LAWS
 from psfdae_paper.configuration.base import config_dir
 
 
@@ -66,6 +67,23 @@ def list_method_groups() -> tuple[str, ...]:
     Methods may share a group, such as both Gaussian mixtures.
     """
     return tuple(dict.fromkeys(group for kind in list_methods() for group in kind.groups))
+
+
+def list_noise_warnings(config: Config) -> list[str]:
+    """Return a line if methods of a dataset assume independent pixels, but its noise has not.
+
+    Parameters
+    ----------
+    config : Config
+        Configuration with the groups noise and methods.
+    """
+    names = [name for name in config.methods if method(name).assumes_independent_pixels]
+    if not names or LAWS[config.noise.law].has_independent_pixels:
+        return []
+    return [
+        f"noise.law = {config.noise.law}: {', '.join(names)} assume independent pixels; "
+        "other estimates are better, and their standard deviations do not hold"
+    ]
 
 
 def sort_oracles_last(names: Iterable[str]) -> list[type[Method]]:

@@ -53,6 +53,7 @@ class Wavefront(Method):
     needs = Needs(level=True)
     storage = None
     packing = None
+    assumes_independent_pixels = True
     fallback: ClassVar = GaussianMixture
     bank_stars: ClassVar[int] = 32000
     draws_per_star: ClassVar[int] = 100
@@ -61,6 +62,12 @@ class Wavefront(Method):
     model: StampModel
     static: np.ndarray
     data: TrainingSet
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        """Raise ConfigError if it is used with other noise than Poisson noise, its likelihood."""
+        if cls.name in config.methods:
+            config.noise.require_poisson(f"methods: {cls.name} is")
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Self:

@@ -81,6 +81,8 @@ def bundle(
     out : Path
         Bundle, a file NAME.psf.safetensors.
     """
+    # A model applied to an image assumes photon noise for its errors.
+    config.noise.require_poisson("model files have errors")
     # Exactly one option names a fit; the option is the name of the method.
     limit_threads(config.evaluation.threads)
     fits_by_name = {key: fit_path for key, fit_path in vars(models).items() if fit_path is not None}

@@ -11,7 +11,6 @@ import numpy as np
 
 from psfdae.base.files import Column
 from psfdae.base.rng import stream
-from psfdae.base.settings import ConfigError
 from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil
 from psfdae.optics.wavefronts import (
     ModalWavefronts,
@@ -143,18 +142,8 @@ def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
         Stage configuration with the groups seed, grid, telescope, wavefront and stars.
     star_field : ndarray of int, shape (n,)
         Field of each star.
-
-    Raises
-    ------
-    ConfigError
-        If random aberrations are not defined in the scene.
     """
     stars = config.stars
-    if isinstance(config.wavefront, VonKarman):
-        raise ConfigError(
-            f"stars.aberration_fraction = {stars.aberration_fraction}: must be 0, stars of this "
-            "scene have no random aberrations"
-        )
     # Every coefficient times (1 + fraction · N(0, 1)); streams bear the name of the set of stars.
     fraction, factors = stars.aberration_fraction, stream(config.seed, "aberration", stars.name)
     aberrations = _static_aberrations(config)

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from psfdae_paper.workflow.run import Run, list_default_datasets, load_dataset_config
+from psfdae_paper.workflow.datasets import star_set
+from psfdae_paper.workflow.run import (
+    Run,
+    exit_in_one_line,
+    list_default_datasets,
+    load_dataset_config,
+)
 
 
 def dataset_files(run: Run, ending: str) -> list[str]:
@@ -11,6 +17,9 @@ def dataset_files(run: Run, ending: str) -> list[str]:
     The ending is ".csv" for means, "_growth.csv" for banks of several sizes, or ".parquet" for
     single stars.
     """
+    for dataset in list_default_datasets(run):
+        with exit_in_one_line(f"dataset={dataset}: "):
+            load_dataset_config(run, dataset).noise.require_poisson("bounds hold")
     return [f"{run.results}/bounds/{dataset}{ending}" for dataset in list_default_datasets(run)]
 
 
@@ -23,7 +32,7 @@ def has_bank(run: Run, dataset: str) -> bool:
 def bank_files(run: Run, dataset: str) -> list[str]:
     """Return the bank of simulated stars of a dataset, if it has one."""
     # Datasets with the same stars differ in noise only, and share the bank.
-    stars = load_dataset_config(run, dataset).stars.name
+    stars = star_set(run, dataset)
     return [f"{run.results}/bounds/bank/{stars}.h5"] if has_bank(run, dataset) else []
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any
 
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.compose import list_datasets
-from psfdae_paper.configuration.consistency import compare_simulations
+from psfdae_paper.configuration.compose import hash_groups, list_datasets
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.workflow.fits import bundle_files, histories, method_names
 from psfdae_paper.workflow.run import (
     SCENE3,
@@ -78,8 +77,9 @@ def _owners() -> tuple[dict[str, str], dict[str, str]]:
         # A dataset without a file is rejected when it is composed, with a better message.
         path = config_dir() / f"dataset/{dataset}.yaml"
         tree = read_yaml(path) if path.is_file() else {}
-        if name := (tree.get("stars") or {}).get("name"):
-            stars.setdefault(name, dataset)
+        # Stars of an own telescope have the name of their dataset.
+        name = (tree.get("stars") or {}).get("name") or dataset
+        stars.setdefault(name, dataset)
         # The scene is an entry of Hydra's list of defaults, such as `/scene: seidel`.
         for entry in tree.get("defaults", []):
             if isinstance(entry, dict) and "/scene" in entry:
@@ -87,40 +87,80 @@ def _owners() -> tuple[dict[str, str], dict[str, str]]:
     return stars, scenes
 
 
-def list_star_sets() -> list[str]:
-    """Return the names of the sets of stars that datasets share."""
-    return list(_owners()[0])
-
-
 def list_scenes() -> list[str]:
-    """Return the names of the scenes."""
+    """Return the names of the scenes of the paper."""
     return sorted(_owners()[1])
-
-
-def stars_choice(stars: str) -> str:
-    """Return the override that chooses the dataset by which a set of stars is simulated."""
-    return f"dataset={_owners()[0][stars]}"
-
-
-def scene_choice(scene: str) -> str:
-    """Return the override that chooses the dataset by which static PSFs are computed."""
-    return f"dataset={_owners()[1][scene]}"
-
-
-def templates_file(run: Run, stars: str) -> str:
-    """Return the static PSFs from which a set of stars is made."""
-    # The override of a scene applies here, too: its name is read from the composed tree.
-    tree = compose_choice(run, stars_choice(stars))
-    return f"{run.results}/data/{tree['scene']['name']}/templates.h5"
 
 
 @cache
 @exit_in_one_line()
-def stars_file(run: Run, dataset: str) -> str:
-    """Return the stars of a dataset, by its `stars.name` or of its own telescope.
+def scene_folder(run: Run, dataset: str) -> str:
+    """Return the name of the folder of a dataset's static PSFs and stars.
 
-    Datasets share the stars of a name, which the first of them simulates. A dataset that changes a
-    group of the simulation would get the stars of the other datasets: it ends the program.
+    It is the name of the scene, whose first dataset computes the PSFs for all datasets with the
+    same settings. A dataset with other settings has a folder whose name ends in their hash.
+    """
+    tree = compose_choice(run, f"dataset={dataset}")
+    name, digest = tree["scene"]["name"], _hash_static(tree)
+    owner = _owners()[1].get(name)
+    is_shared = owner and digest == _hash_static(compose_choice(run, f"dataset={owner}"))
+    return name if is_shared else f"{name}_{digest[:8]}"
+
+
+def _hash_static(tree: dict[str, Any]) -> str:
+    """Return the hash of the settings that decide the static PSFs."""
+    # The position in a pixel belongs to single stars.
+    return hash_groups(STATIC, {**tree, "framing": {**tree["framing"], "subpixel": False}})
+
+
+@cache
+@exit_in_one_line()
+def star_set(run: Run, dataset: str) -> str:
+    """Return the name of a dataset's file of stars.
+
+    It is `stars.name`, if the first dataset with this name has the same settings of the simulation;
+    else their hash follows the name.
+    """
+    tree = compose_choice(run, f"dataset={dataset}")
+    name, digest = tree["stars"]["name"], hash_groups(SIMULATION, tree)
+    owner = _owners()[0].get(name)
+    is_shared = owner and digest == hash_groups(SIMULATION, compose_choice(run, f"dataset={owner}"))
+    return name if is_shared else f"{name}_{digest[:8]}"
+
+
+@cache
+def stars_choice(run: Run, stars: str) -> str:
+    """Return the override that chooses a dataset by which a file of stars is simulated."""
+    return f"dataset={_find_dataset(run, stars, _owners()[0], star_set)}"
+
+
+@cache
+def scene_choice(run: Run, scene: str) -> str:
+    """Return the override that chooses a dataset by which static PSFs are computed."""
+    return f"dataset={_find_dataset(run, scene, _owners()[1], scene_folder)}"
+
+
+@exit_in_one_line()
+def _find_dataset(
+    run: Run, name: str, owners: dict[str, str], name_of: Callable[[Run, str], str]
+) -> str:
+    """Return the owner of a name, or the first dataset that has it by a function."""
+    # Datasets are composed one after the other, only for names with a hash.
+    candidates = [*list_simulated_datasets(), *(variant.name for variant in run.variants)]
+    matches = (d for d in candidates if name_of(run, d) == name)
+    if dataset := owners.get(name) or next(matches, None):
+        return dataset
+    raise ConfigError(f"{run.results}/data: no dataset has {name}")
+
+
+def templates_file(run: Run, dataset: str) -> str:
+    """Return the static PSFs of a dataset."""
+    return f"{run.results}/data/{scene_folder(run, dataset)}/templates.h5"
+
+
+@cache
+def stars_file(run: Run, dataset: str) -> str:
+    """Return the stars of a dataset, which datasets with the same simulation share.
 
     Parameters
     ----------
@@ -129,24 +169,9 @@ def stars_file(run: Run, dataset: str) -> str:
     dataset : str
         Option of the group dataset.
     """
-    config = load_dataset_config(run, dataset)
-    name = config.stars.name
-    # Datasets of own telescopes have stars of their own (own_telescope.smk).
-    if config.scene.name != "telescope":
-        file = os.path.relpath(config_dir() / f"dataset/{dataset}.yaml")
-        advice = f"stars of its own have another stars.name in {file}"
-        if name not in list_star_sets():
-            raise ConfigError(
-                f"dataset={dataset}: stars.name = {name}: no dataset has these stars; {advice}"
-            )
-        tree, choice = compose_choice(run, f"dataset={dataset}"), stars_choice(name)
-        # The first difference ends the program; one is enough for the user to see the cause.
-        for key, value, star_value in compare_simulations(tree, compose_choice(run, choice)):
-            raise ConfigError(
-                f"dataset={dataset}: {key} = {value}, but its stars are simulated by {choice} with "
-                f"{star_value}; {advice}"
-            )
-    return f"{run.results}/data/{config.scene.name}/{name}.h5"
+    # A wrong key ends the program with the dataset's name.
+    load_dataset_config(run, dataset)
+    return f"{run.results}/data/{scene_folder(run, dataset)}/{star_set(run, dataset)}.h5"
 
 
 def networks(run: Run, dataset: str) -> list[tuple[str, str]]:
@@ -202,7 +227,8 @@ def report_category(run: Run, wildcards: Wildcards) -> str:
     # Figures of templates belong to a scene, all others to a dataset: rules have either wildcard.
     experiment: str
     if "scene" in wildcards.keys():  # type: ignore[operator]  # noqa: SIM118 (a named list)
-        experiment = compose_choice(run, scene_choice(wildcards.scene))["scene"]["experiment"]
+        choice = scene_choice(run, wildcards.scene)
+        experiment = compose_choice(run, choice)["scene"]["experiment"]
     else:
         experiment = load_dataset_config(run, wildcards.dataset).scene.experiment
     return SCENE_HEADINGS.get(experiment, experiment)
@@ -218,9 +244,9 @@ def figures(run: Run, dataset: str) -> list[str]:
     config, folder = load_dataset_config(run, dataset), f"{run.results}/figures"
     # Own telescopes are not in the paper: one figure of their field replaces two of the scene.
     if has_own_telescope(run, dataset):
-        fields = [f"telescope/{config.stars.name}"]
+        fields = [f"telescope/{dataset}"]
     else:
-        fields = [f"{config.scene.name}/{name}" for name in ("templates", "energy")]
+        fields = [f"{scene_folder(run, dataset)}/{name}" for name in ("templates", "energy")]
     return [
         *(f"{folder}/{field}.png" for field in fields),
         *([f"{folder}/{dataset}/curves.png"] if histories(run, dataset) else []),
@@ -232,7 +258,9 @@ def figures(run: Run, dataset: str) -> list[str]:
 def products(run: Run, dataset: str) -> list[str]:
     """Return all files that the target of a dataset builds."""
     # Models of own telescopes are for use on images; models of the paper are packed on request.
-    has_bundles = has_own_telescope(run, dataset)
+    # Model files have errors for Poisson noise only.
+    is_poisson = load_dataset_config(run, dataset).noise.law == "poisson"
+    has_bundles = has_own_telescope(run, dataset) and is_poisson
     return [
         *(bundle_files(run, dataset, networks(run, dataset)) if has_bundles else []),
         *evaluations(run, dataset),

@@ -22,7 +22,15 @@ from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Group, Name, parse_settings
 from psfdae.commands.cli import stage
-from psfdae_paper.configuration.compose import compose, load, part, select_overrides, write_settings
+from psfdae_paper.configuration.compose import (
+    compose,
+    load,
+    part,
+    select_overrides,
+    write_settings,
+)
+from psfdae_paper.configuration.experiment import Variant, load_experiment
+from psfdae_paper.configuration.methods import list_noise_warnings
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.source import SOURCES, describe_machine, git_commit, source_hash
 
@@ -46,6 +54,8 @@ class CommandLine(Group):
     """Hydra overrides for every dataset, separated by spaces."""
     sweep: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]*$")] = ""
     """Sweep of a file of config/sweep, for the target sweep."""
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_]*$")] = ""
+    """File of config/experiment, for the target experiment."""
     images: str = ""
     """Images of a night, as night/*.fits or a CSV list, for the target night."""
     telescope: str = ""
@@ -81,6 +91,10 @@ class Run:
         The command line names this folder, so that its run may be replaced.
     sweep, images, telescope : str
         As of `CommandLine`; empty if they are not given.
+    experiment : str
+        Name of the experiment; empty if there is none.
+    variants : tuple of Variant
+        Datasets with the overrides of the experiment.
     is_dry : callable
         Returns True if no file is to be written. Snakemake knows it after it has read all rules.
     """
@@ -93,6 +107,8 @@ class Run:
     images: str = ""
     telescope: str = ""
     is_dry: Callable[[], bool] = bool
+    experiment: str = ""
+    variants: tuple[Variant, ...] = ()
 
 
 @contextmanager
@@ -152,7 +168,10 @@ def read_run(words: Mapping[str, Any], is_dry: Callable[[], bool] = bool) -> Run
         hint = did_you_mean(word, option_names)
         raise ConfigError(f"--config {word}: there are {', '.join(option_names)}{hint}")
     earlier_run = read_finished_run(str(options["results"])) if "results" in options else {}
-    line = parse_settings(CommandLine, {**earlier_run, **options})
+    # An experiment has a preset of its own.
+    experiment = load_experiment(str(options["name"])) if "name" in options else None
+    own_preset = {"preset": experiment.preset} if experiment else {}
+    line = parse_settings(CommandLine, {**earlier_run, **own_preset, **options})
     # As in a shell, so that an override may contain quoted spaces.
     try:
         overrides = (f"preset={line.preset}", *shlex.split(line.set))
@@ -169,6 +188,8 @@ def read_run(words: Mapping[str, Any], is_dry: Callable[[], bool] = bool) -> Run
         line.images,
         line.telescope,
         is_dry,
+        line.name,
+        experiment.variants if experiment else (),
     )
 
 
@@ -202,10 +223,12 @@ def require_same_run(run: Run) -> None:
         Run that is about to start.
     """
     earlier_run = read_finished_run(run.results)
-    if run.is_folder_named or run.sweep or run.images or not earlier_run:
+    if (run.is_folder_named and not run.experiment) or run.sweep or run.images or not earlier_run:
         return
-    # The first override is the preset, which decides the default folder already.
+    # The preset decides the default folder already; an experiment may be in a folder with a name.
     earlier_words, words = shlex.split(earlier_run.get("set") or ""), run.overrides[1:]
+    if run.experiment and earlier_run.get("preset", run.preset) != run.preset:
+        earlier_words, words = [f"preset={earlier_run['preset']}", *earlier_words], run.overrides
     missing = " ".join(word for word in earlier_words if word not in words)
     additional = " ".join(word for word in words if word not in earlier_words)
     if missing or additional:
@@ -225,8 +248,8 @@ def record_run(run: Run) -> None:
 
     The commit is the one with which the files of the run's target are up to date.
     """
-    # Sweeps and nights add to a folder without changing the run in it.
-    if not (run.sweep or run.images):
+    # Sweeps, experiments and nights add to a folder without changing the run in it.
+    if not (run.sweep or run.images or run.experiment):
         record = {
             "preset": run.preset,
             "set": shlex.join(run.overrides[1:]),
@@ -270,11 +293,27 @@ def compose_choice(run: Run, *choice: str, extra: tuple[str, ...] = ()) -> dict[
     run : Run
         Its overrides are selected by `select_overrides`.
     *choice : str
-        Such as dataset=dataset3.
+        Such as dataset=dataset3. A variant of an experiment is its dataset with its overrides.
     extra : tuple of str
         Further overrides of one job.
     """
-    return compose((*choice, *select_overrides(run.overrides, choice), *extra))
+    return compose((*list_words(run, *choice), *extra))
+
+
+def list_words(run: Run, *choice: str) -> tuple[str, ...]:
+    """Return a choice, and the overrides of the run and of a variant that concern it.
+
+    Raises
+    ------
+    ConfigError
+        If an option does not exist.
+    """
+    words = run.overrides
+    for variant in run.variants:
+        if f"dataset={variant.name}" in choice:
+            choice, words = (f"dataset={variant.dataset}",), (*words, *variant.overrides)
+            break
+    return (*choice, *select_overrides(words, choice))
 
 
 @cache
@@ -282,8 +321,12 @@ def load_dataset_config(run: Run, dataset: str) -> Config:
     """Return the checked configuration of a dataset; a wrong key ends the program."""
     # The message begins with the dataset, as one command may build several.
     choice = f"dataset={dataset}"
-    with exit_in_one_line(f"{choice}: "):
-        return load((choice, *select_overrides(run.overrides, (choice,))))
+    names = {v.name: f"{v.dataset}, setting {v.setting}" for v in run.variants}
+    with exit_in_one_line(f"dataset={names.get(dataset, dataset)}: "):
+        config = load(list_words(run, choice))
+    for line in list_noise_warnings(config) if dataset != SCENE3 else ():
+        print(f"psfdae: {choice}: {line}", file=sys.stderr)
+    return config
 
 
 @cache

@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 from psfdae.methods import fit_files, method
-from psfdae_paper.workflow.datasets import list_scenes, list_simulated_datasets
+from psfdae_paper.workflow.datasets import list_scenes, list_simulated_datasets, scene_folder
 from psfdae_paper.workflow.fits import bundle_file, bundle_files, method_names
 from psfdae_paper.workflow.run import (
     Run,
@@ -69,9 +69,7 @@ def strictest_dataset(run: Run, scene: str) -> str:
         return (-min(config.noise.levels), config.stars.aberration_fraction)
 
     # Optics that are accurate enough for this dataset are accurate enough for the whole scene.
-    datasets = [
-        d for d in list_simulated_datasets() if load_dataset_config(run, d).scene.name == scene
-    ]
+    datasets = [d for d in list_simulated_datasets() if scene_folder(run, d) == scene]
     return max(datasets, key=strictness)
 
 

@@ -17,6 +17,14 @@ from psfdae.methods.metrics import (
 )
 from psfdae_paper.evaluation import readable
 from psfdae_paper.evaluation.alignment_tables import correlate_errors
+from psfdae_paper.evaluation.experiments import (
+    NUMBERS,
+    ROW,
+    Variant,
+    compare_settings,
+    draw_experiment,
+    format_settings,
+)
 from psfdae_paper.evaluation.paper import format_paper_table, paper_table, read_published
 
 
@@ -138,3 +146,76 @@ def test_correlation_is_pearson_s_with_fisher_s_interval():
         correlate_errors(errors * np.nan)
     with pytest.raises(ValueError, match="at least one"):
         correlate_errors(errors[:0])
+
+
+# Experiments
+
+VARIANTS = [
+    Variant(f"v{setting}{seed}", "dataset3", setting, seed)
+    for setting in ("paper", "b", "a")
+    for seed in (1, 2, 3)
+]
+"""Settings whose order is not alphabetical."""
+
+
+def evaluations_of_variants():
+    """MSE and SSIM of one method at two levels, of which the setting a has only one."""
+    key = {"split": "random", "reference": "realisation", "method": "dae", "n": 50}
+    rows = []
+    for variant in VARIANTS:
+        for level in (1e-3, 2e-3) if variant.setting != "a" else (2e-3,):
+            factor = {"paper": 1.0, "b": 2.0, "a": 3.0 + 0.1 * variant.seed}[variant.setting]
+            mse = 1e-3 * factor * level * variant.seed
+            row = {**key, "dataset": variant.name, "noise_level": level, "stderr": 0.1 * mse}
+            rows += [{**row, "metric": "mse", "value": mse}]
+            rows += [{**row, "metric": "ssim", "value": 1 - mse}]
+    return pd.DataFrame(rows)
+
+
+def test_settings_are_compared_by_means_over_seeds_and_ratios_of_the_same_seed():
+    table = compare_settings(evaluations_of_variants(), VARIANTS)
+    assert list(table.columns) == [*ROW, "setting", *NUMBERS]
+    mse = table[table.metric == "mse"].set_index(["noise_level", "setting"])
+    assert list(mse.loc[2e-3].index) == ["paper", "b", "a"] and list(mse.loc[1e-3].index)[1:] == [
+        "b"
+    ]
+    assert set(table.seeds) == {3} and set(table.stars) == {150}
+    # Seeds 1, 2, 3 times 2e-6: the mean is 4e-6, the standard error 2e-6 / √3.
+    paper, other = mse.loc[(2e-3, "paper")], mse.loc[(2e-3, "a")]
+    assert paper.value == pytest.approx(4e-6)
+    assert paper.stderr == pytest.approx(2e-6 / 3**0.5)
+    assert paper.stderr_stars == pytest.approx(0.1 * 2e-6 * (1 + 4 + 9) ** 0.5 / 3)
+    # Ratios of the same seed vary less than the values: 3.1, 3.2 and 3.3.
+    assert (paper.ratio, paper.ratio_stderr) == (1, 0)
+    assert other.ratio == pytest.approx(3.2)
+    assert other.ratio_stderr == pytest.approx(0.1 / 3**0.5)
+    # One seed has no scatter.
+    evaluations = evaluations_of_variants()
+    is_first = evaluations.dataset.isin([variant.name for variant in VARIANTS[::3]])
+    single = compare_settings(evaluations[is_first], VARIANTS[::3])
+    assert single.stderr.isna().all() and single.value.notna().all()
+
+
+def test_the_table_and_the_figure_of_an_experiment_show_all_settings():
+    table = compare_settings(evaluations_of_variants(), VARIANTS)
+    lines = format_settings(table, "mine").splitlines()
+    assert lines[2] == "| dataset | split | reference | method | λ | paper | b | a |"
+    assert lines[4].endswith("| realisation | dae | 0.001 | 2 ± 0.58 | 4 ± 1.2 |  |")
+    figure = draw_experiment(table, "mine")
+    (panel,) = figure.axes
+    assert [bars.get_label() for bars in panel.containers] == ["paper", "b", "a"]
+    line, *_ = panel.containers[0]
+    assert line.get_xydata() == pytest.approx(np.array([[1e-3, 1.0], [2e-3, 1.0]]))
+    _, _, (bars,) = panel.containers[2]
+    assert bars.get_segments()[0][:, 1] == pytest.approx(3.2 + np.array([-0.1, 0.1]) / 3**0.5)
+    assert (panel.get_title(), panel.get_xlabel()) == ("DAE", "noise level λ")
+    assert figure.get_supylabel() == "MSE / MSE of paper"
+    # Without a common level, the errors themselves.
+    rows = table[
+        (table.setting != "b") & ~((table.setting == "paper") & (table.noise_level > 1e-3))
+    ]
+    apart = draw_experiment(rows.assign(ratio=rows.ratio.where(rows.setting == "paper")), "mine")
+    line, _, (bars,) = apart.axes[0].containers[0]
+    assert line.get_xydata() == pytest.approx(np.array([[1e-3, 2e-6]]))
+    assert bars.get_segments()[0][:, 1] == pytest.approx(2e-6 + np.array([-1, 1]) * 1e-6 / 3**0.5)
+    assert "3 seeds of 50 test stars" in figure.get_suptitle()

@@ -9,8 +9,9 @@ import pytest
 
 from psfdae.base.files import Product
 from psfdae.base.rng import stream
+from psfdae.methods.lmmse import LinearMmse
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae.stars.noise import draw_levels
+from psfdae.stars.noise import LAWS, NoiseModel, build_noise, draw_levels
 from psfdae.stars.splits import (
     draw_jitter,
     draw_phase,
@@ -148,6 +149,79 @@ def test_noise_has_the_paper_s_rms_and_the_star_s_photons(noise, gaussian_stars,
     bright = psf > 0.02
     ratio = (error**2 / expected)[bright]
     assert ratio.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / ratio.size))
+
+
+NOISE = {
+    "poisson": {},
+    "gaussian": {},
+    "detector": {"read_noise_e": 150.0, "gain_e": 200.0},
+    "correlated": {"shift_px": 0.3},
+}
+
+
+def noise_of_law(law):
+    """The paper's levels by another law."""
+    values = {"law": law, "kappa": 4.98, "background_photons": 1e4, **NOISE[law]}
+    return build_noise(values)
+
+
+@pytest.mark.parametrize("draw", ["draw", "draw_gaussian"])
+@pytest.mark.parametrize("law", LAWS)
+def test_noise_of_every_law_has_its_covariance(gaussian_stars, law, draw):
+    """At the same level all laws have the same noise of the sky."""
+    noise, level, draws = noise_of_law(law), 3e-4, 6000
+    psf = gaussian_stars[0]
+    images = np.repeat(psf[None], draws, axis=0)
+    error = (
+        getattr(noise, draw)(images, level, stream(1, law, draw)).reshape(draws, -1) - psf.ravel()
+    )
+    expected = noise.covariance(psf.ravel(), level)
+    variance = np.diag(expected)
+    assert variance == pytest.approx(noise.variance(psf, level).ravel(), rel=1e-6)
+    assert variance.min() == pytest.approx((4.98 * level) ** 2, rel=0.02)
+    # Covariances of all pairs of pixels, in units of their standard errors.
+    correlation = expected / np.sqrt(np.outer(variance, variance))
+    unit = error / np.sqrt(variance)
+    deviation = (unit.T @ unit / draws - correlation) / np.sqrt((1 + correlation**2) / draws)
+    assert np.square(deviation).mean() == pytest.approx(1, abs=0.05)
+    assert np.abs(deviation).max() < 6
+    assert np.abs(unit.mean(axis=0)).max() < 5 / np.sqrt(draws)
+    # The star's photons add noise by every law but one.
+    photons = 0.0 if law == "gaussian" else psf.max() / noise.flux(level)
+    assert variance.max() == pytest.approx((4.98 * level) ** 2 + photons, rel=1e-6)
+    neighbours = correlation[0, 1]
+    assert neighbours == pytest.approx(0.21 / 0.58 if law == "correlated" else 0.0)
+
+
+def test_the_paper_s_noise_is_photons_alone(noise, gaussian_stars):
+    """Settings without a law, as of earlier versions, have it, too."""
+    flux = np.sqrt(1e4) / (4.98 * 1e-3)
+    photons = stream(3, "n").poisson(flux * gaussian_stars + 1e4)
+    images = noise_of_law("poisson").draw(gaussian_stars, 1e-3, stream(3, "n"))
+    assert images.tobytes() == ((photons - 1e4) / flux).astype(np.float32).tobytes()
+    assert build_noise({"kappa": 4.98, "background_photons": 1e4}) == noise
+    assert type(noise_of_law("poisson")) is NoiseModel
+
+
+def test_a_detector_rounds_to_whole_counts(gaussian_stars):
+    noise = noise_of_law("detector")
+    images = noise.draw(gaussian_stars, 1e-3, stream(4, "n")).astype(np.float64)
+    counts = (images * noise.flux(1e-3) + 1e4) / 200.0
+    assert np.abs(counts - np.rint(counts)).max() < 1e-3
+
+
+def test_a_linear_estimator_knows_correlated_noise(gaussian_stars):
+    """Its error is the one that follows from the covariances, and less than by variances alone."""
+    noise, level = noise_of_law("correlated"), 3e-3
+    stars = np.repeat(gaussian_stars, 20, axis=0)
+    noisy = noise.draw(stars, level, stream(5, "n"))
+    fit = LinearMmse.from_images(gaussian_stars, gaussian_stars, noise)
+    white = LinearMmse.from_images(gaussian_stars, gaussian_stars, noise_of_law("poisson"))
+    error, white_error = (np.square(m.predict(noisy, level) - stars).mean() for m in (fit, white))
+    system = fit.cov_xx + noise.covariance(fit.mean_x, level)
+    expected = np.trace(fit.cov_xx - fit.cov_yx @ np.linalg.solve(system, fit.cov_yx.T))
+    assert error == pytest.approx(expected / stars[0].size, rel=0.05)
+    assert 1.05 < white_error / error < 5
 
 
 def test_noise_is_that_of_the_star_in_every_split_and_independent_between_sets(

@@ -36,7 +36,7 @@ from psfdae.methods.interface import (
 )
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.moments import measure_shapes
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.noise import build_noise
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,6 +74,7 @@ class FieldMixture(FieldPrior, Method):
     """Names of attributes by the older names of their arrays in files."""
     packing = Packing(batch_size=4096, is_padded=False)
     knows_field = True
+    assumes_independent_pixels = True
     groups: ClassVar = {"field": FieldSettings}
 
     @classmethod
@@ -137,7 +138,7 @@ class FieldMixture(FieldPrior, Method):
 
         Settings that this release does not know are ignored: they only affect the fit.
         """
-        noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
+        noise = build_noise(config["noise"])
         # Modes may be in half precision; three arrays have older names in files.
         fields: dict[str, Any] = {cls.attributes.get(n, n): array for n, array in arrays.items()}
         fields["modes"] = arrays["modes"].astype(np.float32)
