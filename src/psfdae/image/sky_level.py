@@ -261,10 +261,10 @@ def correlate_sources(
     row, column = row[brightest] + 2, column[brightest] + 2
     wide_image = np.pad(deviation, 6, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
-    own, *others = (windows[row + down, column + across] for down, across in [(0, 0), *lags])
+    source, *neighbours = (windows[row + down, column + across] for down, across in [(0, 0), *lags])
     # Products of a source with itself; the noise of 81 pixels adds its own.
-    products = np.array([(own * other).sum(axis=(1, 2)) for other in (own, *others)])
-    products -= own[0].size * np.append(1.0, noise_correlations)[:, None]
+    products = np.array([(source * pixels).sum(axis=(1, 2)) for pixels in (source, *neighbours)])
+    products -= source[0].size * np.append(1.0, noise_correlations)[:, None]
     products = products[:, np.isfinite(products).all(axis=0)]
     if products.shape[1] < 5:
         return np.ones(len(lags))

@@ -143,8 +143,8 @@ def find_spikes(
             scatter = SIGMA_OF_MAD * np.ma.median(np.abs(low), axis=0)
             limit = np.maximum(4.0 * scatter.filled(np.inf), 0.6 / np.sqrt(run))
             # Spikes come in opposite pairs, of which each is evidence of the other.
-            both = np.ma.minimum(low, np.roll(low, angles // 2, axis=0))
-            is_light = (low > limit).filled(False) | (both > 0.5 * limit).filled(False)
+            pair_light = np.ma.minimum(low, np.roll(low, angles // 2, axis=0))
+            is_light = (low > limit).filled(False) | (pair_light > 0.5 * limit).filled(False)
             is_light &= (low > 0.4 * high).filled(False)
             # A ray ends at the last part with light, of which three of four from the core on have
             # some, but for the first ones in which the halo is so uneven that it hides spikes.
