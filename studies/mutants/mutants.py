@@ -26,6 +26,7 @@ import sys
 import textwrap
 import time
 from collections import defaultdict
+from contextlib import chdir
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -150,13 +151,13 @@ def write_mutants(clone: Path) -> None:
 
 def record_tests(clone: Path, path: Path) -> None:
     """Run the tests without a mutant, and write which of them call which function."""
-    os.chdir(clone)
-    config()  # mutmut reads it in the current folder, once
-    os.chdir("mutants")
+    with chdir(clone):
+        config()  # mutmut reads it in the current folder, once
     # In this process only: programs that tests start do not record.
     trampoline._mutant_under_test = "stats"
     recorder = CallRecorder()
-    pytest.main([*OPTIONS, *TESTS], plugins=[recorder])
+    with chdir(clone / "mutants"):
+        pytest.main([*OPTIONS, *TESTS], plugins=[recorder])
     path.write_text(json.dumps(recorder.record()))
 
 
@@ -200,8 +201,9 @@ def change_of(mutant: str, tree: Path) -> str:
     lines = {}
     for function in (original, name):
         # A module has megabytes of mutants: only these two functions are parsed. They end before
-        # the next line that is indented as they are, but for the end of their arguments.
-        found = re.search(rf"^( *)def {function}\(.*?(?=^\1[^\s)]|\Z)", code, re.M | re.S)
+        # the next line that is not indented more than they are, but for the end of their arguments.
+        end = r"(?=^(?!\1 ) *[^\s)]|\Z)"
+        found = re.search(rf"^( *)def {function}\(.*?{end}", code, re.M | re.S)
         assert found is not None, mutant
         text = ast.unparse(ast.parse(textwrap.dedent(found[0])))
         lines[function] = text.replace(function, original).splitlines()
