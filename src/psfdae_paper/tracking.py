@@ -279,7 +279,7 @@ def make_bundle(kind: type[Method], fit: Path, stars: Path, reference: str, name
 
 def _list_fit_files(kind: str, place: Path) -> list[Path]:
     """Return the files of a method, or of a network of scene 3; `place` is its folder or file."""
-    if kind in estimators.ESTIMATORS:
+    if kind in estimators.list_trained_networks():
         return [place / estimators.Estimator.weights_file, place / CONFIG]
     return fits.own_files(method(kind), place)
 

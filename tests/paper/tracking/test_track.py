@@ -195,8 +195,8 @@ def test_scene_3_and_a_night_are_read_from_their_tables(tmp_path):
     for kind in ("dae", *list_trained_networks()):
         folder = tmp_path / "alignment" / kind
         folder.mkdir(parents=True)
-        for name in ("dae.safetensors", Estimator.weights_file):
-            (folder / name).write_bytes(b"weights")
+        name = "dae.safetensors" if kind == "dae" else Estimator.weights_file
+        (folder / name).write_bytes(b"weights")
         (folder / "config.yaml").write_text("seed: 7\nattempt: 1\n")
         write_history(folder / "history.csv")
     runs = {run.key[0]: run for run in tracking.read_alignment_runs(tmp_path)}
@@ -206,6 +206,7 @@ def test_scene_3_and_a_night_are_read_from_their_tables(tmp_path):
     metrics = runs["original"].metrics
     assert metrics["grid_tilt_y_bias_0.002"] == pytest.approx(row.bias.item())
     assert metrics["grid_tilt_y_mean_abs_error_0.002"] == pytest.approx(row.mean_abs_error.item())
+    assert all(file.is_file() for run in runs.values() for file in run.fit_files)
     assert runs["original"].config == {"seed": 7} and len(runs["original"].epochs) == 3
 
     night = tmp_path / "night/night.csv"
