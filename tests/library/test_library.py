@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import shutil
+import tempfile
 from dataclasses import replace
 from functools import partial
 
@@ -51,6 +52,17 @@ def test_the_command_is_the_calls_which_are_silent_and_write_nothing(
     assert table.mse.to_numpy() == pytest.approx(np.asarray(report.table["mse"]), rel=1e-5)
     report.save(tmp_path / "same.html")
     assert (tmp_path / "same.html").read_bytes() == training.page.read_bytes() == page.encode()
+
+
+def test_a_network_is_fitted_without_a_file_for_its_state(stars, tmp_path, monkeypatch):
+    """A call gives no file for interrupted trainings; nothing is left of a temporary one."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with few_draws():
+        model = psfdae.fit(stars, method="dae", epochs=2, widths=[4] * 9)
+    size = model.info.stamp_px
+    middle = stars.mean_psf[8:-8, 8:-8]
+    assert middle.shape == (size, size) and np.isfinite(model.predict(middle).psf).all()
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_lines_of_the_pages_run(training, tmp_path, monkeypatch):

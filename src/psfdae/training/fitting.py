@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
@@ -84,7 +85,8 @@ def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = No
     kind : type of Method
         Class of the method.
     checkpoint : Path, optional
-        File for the state of a long fit, from which it goes on if it was interrupted.
+        File for the state of a long fit, from which it goes on if it was interrupted. Without it,
+        an interrupted fit is lost.
 
     Raises
     ------
@@ -92,8 +94,13 @@ def fit_method(stars: ImageStars, kind: type[Kind], checkpoint: Path | None = No
         If the method needs a package that is not installed.
     """
     # The stars as the method takes them: of the image, without those that are held out.
-    data = stars.training_set(kind, checkpoint=checkpoint)
-    with fix_threads(kind.threads(stars.settings)), require_extra(f"the method {kind.name}"):
+    # Networks write their state to a file, which is temporary if none is given.
+    with (
+        TemporaryDirectory() as folder,
+        fix_threads(kind.threads(stars.settings)),
+        require_extra(f"the method {kind.name}"),
+    ):
+        data = stars.training_set(kind, checkpoint=checkpoint or Path(folder, "checkpoint.pt"))
         return kind.fit(data, **kind.settings(stars.settings))
 
 
