@@ -36,6 +36,8 @@ class Points(Group):
         Datasets on which all methods of the configuration are timed.
     further_methods : list of str
         Methods that are timed beside those.
+    networks : list of str
+        Methods that are timed only by the target `posterior_network`, because they train for long.
     settings : dict
         Overrides of the configuration, by method and by the name of the point.
     trials : dict
@@ -44,6 +46,7 @@ class Points(Group):
 
     datasets: Annotated[list[str], Field(min_length=1)]
     further_methods: list[str]
+    networks: list[str]
     settings: Settings
     trials: Settings
 
@@ -162,7 +165,9 @@ def costs(
     """Join ROWS, tables of the command cost, and mark the knee of the trainings of each dataset."""
     import pandas as pd
 
+    # Rows may come from a joined table, which has the columns that are added here.
     table, points = pd.concat(map(read_table, rows), ignore_index=True), load_points()
+    table = table.drop(columns=["settings", "knee"], errors="ignore")
     overrides = [points.overrides(row.dataset, row.method)[row.point] for row in table.itertuples()]
     table.insert(3, "settings", [" ".join(words) for words in overrides])
     # Trainings of the configured network that differ in nothing but their length.

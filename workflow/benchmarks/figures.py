@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from costs import method_class
+from measure import pareto
 from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure, write_png
 from psfdae.base.files import ProductError
 from psfdae.base.options import File
@@ -139,7 +140,12 @@ def costs(table):
     for row, (dataset, measured) in zip(panels, table.groupby("dataset"), strict=True):
         for name, points in measured.groupby("method", sort=False):
             draw_method(*row, points, method_class(name).look)
-        for axes in row:
+        used = measured[measured["used"]]
+        for axes, times in zip(row, (measured["fit_cpu_s"], used["star_ms"]), strict=True):
+            # Settings that no other one beats in both time and error.
+            time, error = times.to_numpy(), measured.loc[times.index, "over_least"].to_numpy()
+            front = pareto(time, error)
+            axes.plot(time[front], error[front], color="0.6", lw=3.0, zorder=0)
             axes.axhline(1.0, color="black", lw=1.0)
             axes.set(**LOGS)
             axes.grid(True, which="both")
@@ -154,6 +160,7 @@ def costs(table):
     looks = [method_class(name).look for name in table["method"].unique()]
     handles = [entry(x.label, color=x.color, marker=x.marker, ls="", ms=8) for x in looks]
     handles += [entry(label, **{**style, "ms": 9}) for label, style in MARKS.values()]
+    handles.append(entry("Pareto front", color="0.6", lw=3.0))
     handles.append(entry("least possible error", color="black", lw=1.0))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.suptitle("Error against time: fit (left) and inference (right)")

@@ -87,6 +87,32 @@ rule figure_benchmark:
         " --table {input} --out {output} > {log} 2>&1"
 
 
+use rule figure_benchmark as posterior_network with:
+    input:
+        rules.posterior_network_costs.output,
+    output:
+        report(
+            f"{RESULTS}/figures/benchmark/posterior_network.png",
+            caption="../report/figure_benchmark.rst",
+            category="Benchmark: time against error",
+            subcategory="costs",
+            labels={
+                "figure": "all methods and posterior networks: error against time"
+            },
+        ),
+    log:
+        f"{RESULTS}/logs/figures/benchmark/posterior_network.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/figure_posterior_network.tsv"
+    params:
+        source=hash_code("workflow/benchmarks/figures.py"),
+        program=locate_program("figures.draw"),
+        kind="costs",
+        scene=[],
+    message:
+        "Drawing errors of all methods and of the posterior networks against time"
+
+
 rule benchmark:
     input:
         rules.propagation_tables.output,

@@ -56,6 +56,22 @@ rule benchmark_costs:
         "python {params.program} --out {output} {input} > {log} 2>&1"
 
 
+# All methods, and the networks that are trained on simulated stars without end: on request, because
+# they train for minutes.
+use rule benchmark_costs as posterior_network_costs with:
+    input:
+        rules.benchmark_costs.output,
+        lambda w: timings.network_cost_tables(RUN),
+    output:
+        f"{RESULTS}/tables/posterior_network.csv",
+    log:
+        f"{RESULTS}/logs/costs/posterior_network.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/posterior_network.tsv"
+    message:
+        "Joining errors and times of all methods and of the posterior networks"
+
+
 rule benchmark_inference:
     output:
         f"{RESULTS}/tables/benchmark_inference.csv",

@@ -39,12 +39,29 @@ def cost_tables(run: Run) -> list[str]:
     # Methods that do not denoise are left out, unless the file lists them as further methods.
     points = load_timing_points()
     return [
-        f"{run.results}/costs/{dataset}/{name}-{point}.csv"
+        path
         for dataset in points.datasets
         for name in [*method_names(run, dataset), *points.further_methods]
         if name in points.further_methods or method(name).look.restores
-        for point in points.overrides(dataset, name)
+        for path in _cost_tables_of(run, dataset, name)
     ]
+
+
+def network_cost_tables(run: Run) -> list[str]:
+    """Return the tables of the networks that are trained on simulated stars without end."""
+    points = load_timing_points()
+    return [
+        path
+        for dataset in points.datasets
+        for name in points.networks
+        for path in _cost_tables_of(run, dataset, name)
+    ]
+
+
+def _cost_tables_of(run: Run, dataset: str, name: str) -> list[str]:
+    """Return the tables of a method of a dataset, one for each of its settings."""
+    points = load_timing_points().overrides(dataset, name)
+    return [f"{run.results}/costs/{dataset}/{name}-{point}.csv" for point in points]
 
 
 def get_point_overrides(wildcards: Wildcards) -> tuple[str, ...]:

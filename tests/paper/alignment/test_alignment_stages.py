@@ -169,7 +169,7 @@ def test_twin_is_closer_in_focus(results):
 
 
 def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
-    runs = {run.kind: run for run in read_alignment_runs(results)}
+    runs = {run.key[0]: run for run in read_alignment_runs(results)}
     assert set(runs) == {"dae", *list_trained_networks()}
     for kind, run in runs.items():
         history = pd.read_csv(results / "alignment" / kind / "history.csv")

@@ -185,9 +185,17 @@ class Training(ABC):
     """
 
     grad_clip = float("inf")
+    half_precision_start = 0.5
+    """Fraction of the epochs after which half precision is used.
+
+    In all epochs it increases errors of the DAE by up to 2 %, but not in the second half of the
+    epochs alone (studies/training).
+    """
     state_dicts = ("model", "optimiser", "scheduler")
     """Attributes whose `state_dict` a checkpoint contains."""
-    plain_fields = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
+    plain_fields: tuple[str, ...] = (
+        *("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state"),
+    )
     """Attributes that a checkpoint contains unchanged."""
 
     def __init__(
@@ -291,9 +299,8 @@ class Training(ABC):
 
     def take_step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
         """Make a step of the optimiser with a batch, and return the loss before it."""
-        # Half precision in all epochs increases errors by up to 2 %, but not in the second half of
-        # the epochs alone (studies/training).
-        with use_half_precision(2 * len(self.history) >= self.settings.epochs):
+        is_late = len(self.history) >= self.half_precision_start * self.settings.epochs
+        with use_half_precision(is_late):
             loss = self.loss(batch, step)
         value = self._finite("loss", loss, step)
         self.optimiser.zero_grad(set_to_none=True)

@@ -1,0 +1,212 @@
+"""The posterior network: its linear start, its symmetry, and a training on simulated stars."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from costs import load_points
+from psfdae.base.files import read_product
+from psfdae.base.settings import parse_settings
+from psfdae.methods import method
+from psfdae.methods.interface import FitError
+from psfdae.stars.noise import NoiseModel
+from psfdae.training.star_sets import training_set
+from psfdae_paper.bounds.estimates import propagate_static_psfs
+from psfdae_paper.bounds.posterior_network import (
+    FreshStars,
+    PosteriorNetwork,
+    list_representations,
+    measure_statistics,
+)
+from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
+from psfdae_paper.stages import stars
+from psfdae_paper.stars.symmetry import SYMMETRIES
+
+NOISE, LEVELS = NoiseModel(kappa=4.98, background=1e4), np.array([1e-3, 5e-3])
+SIZES = {"width": 32, "hidden": 64, "blocks": 2}
+WORDS = (
+    "dataset=dataset3",
+    "preset=smoke",
+    "grid.points=3",
+    "stars.count=90",
+    "grid.spacing_deg=5",
+)
+WORDS += ("parts.train_stars=60", "parts.test_stars=30")
+
+
+def build(stamps, symmetries=8, uses_position=False):
+    statistics = measure_statistics(stamps.reshape(len(stamps), -1), LEVELS, points=11)
+    settings = parse_settings(PosteriorNetworkSettings, SIZES)
+    rng = np.random.default_rng(0)
+    return PosteriorNetwork.build(statistics, settings, symmetries, NOISE, uses_position, rng)
+
+
+def randomise(network):
+    """Give all weights random values, so that no layer is zero."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.copy_(0.3 * torch.randn(weight.shape, generator=generator))
+    return network
+
+
+def mirror(images, symmetry):
+    """Mirror images about the pixel d // 2; their first row and column are zero."""
+    mirrored = np.zeros_like(images)
+    mirrored[..., 1:, 1:] = symmetry.image(images[..., 1:, 1:])
+    return mirrored
+
+
+def test_new_network_is_the_posterior_mean_of_one_gaussian_mode():
+    """p = m + a u with a ~ N(0, τ²): the mean of a is τ²/(τ² + s²) times its projection."""
+    rng, side, tau = np.random.default_rng(3), 8, 0.02
+    mode = rng.standard_normal((side, side))
+    mode = (mode - mode.mean()) / np.linalg.norm(mode - mode.mean())
+    amplitudes = rng.standard_normal(400)
+    amplitudes = tau * (amplitudes - amplitudes.mean()) / amplitudes.std()
+    stamps = 1 / side**2 + amplitudes[:, None, None] * mode
+    noisy = NOISE.draw(stamps, 1e-3, rng)
+    psf, _ = build(stamps).estimate(noisy, np.full(400, 1e-3), None)
+    variance = NOISE.variance(np.array(1 / side**2), 1e-3)
+    projection = ((noisy - 1 / side**2) * mode).sum(axis=(1, 2), keepdims=True)
+    expected = 1 / side**2 + tau**2 / (tau**2 + variance) * projection * mode
+    assert psf == pytest.approx(expected, abs=2e-7)
+    # The mean errors are those of the posterior.
+    error = np.square(psf - stamps).sum(axis=(1, 2)).mean()
+    assert error == pytest.approx(tau**2 * variance / (tau**2 + variance), rel=0.2)
+
+
+@pytest.mark.parametrize("symmetries", [1, 8])
+def test_estimates_have_the_sum_1(symmetries):
+    rng = np.random.default_rng(4)
+    stamps = rng.random((300, 8, 8))
+    stamps /= stamps.sum(axis=(1, 2), keepdims=True)
+    network = randomise(build(stamps, symmetries))
+    psf, sigma = network.estimate(NOISE.draw(stamps, 5e-3, rng), np.full(300, 5e-3), None)
+    assert psf.std(axis=0).min() > 1e-4
+    assert psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
+    assert (sigma > 0).all()
+
+
+def test_network_commutes_with_mirror_images(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    rng, level = np.random.default_rng(5), np.full(6, 2e-3)
+    stamps = np.zeros((200, 8, 8))
+    stamps[:, 1:, 1:] = rng.random((200, 7, 7))
+    stamps /= stamps.sum(axis=(1, 2), keepdims=True)
+    every = np.concatenate([mirror(stamps, symmetry) for symmetry in SYMMETRIES])
+    network = randomise(build(every, uses_position=True))
+    position = rng.integers(0, 11, (6, 2))
+    psf, sigma = network.estimate(stamps[:6], level, position)
+    assert np.abs(psf - psf[0]).max() > 1e-3
+    for symmetry in SYMMETRIES:
+        fields = symmetry.field(position @ [1, 11], 11)
+        place = np.stack(np.divmod(fields, 11)[::-1], axis=1)
+        moved, moved_sigma = network.estimate(mirror(stamps[:6], symmetry), level, place)
+        assert moved == pytest.approx(mirror(psf, symmetry), abs=2e-6)
+        inner = mirror(sigma, symmetry)[:, 1:, 1:]
+        assert moved_sigma[:, 1:, 1:] == pytest.approx(inner, rel=1e-4)
+
+
+def test_representations_are_orthonormal():
+    waves = list_representations(SYMMETRIES)
+    assert waves @ waves.T == pytest.approx(np.eye(8), abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def product(tmp_path_factory):
+    """Simulated stars of scene 1 on nine fields."""
+    folder = tmp_path_factory.mktemp("stars")
+    stars.templates(load_stage(STATIC, WORDS), folder / "templates.h5")
+    config = load_stage(SIMULATION, WORDS)
+    stars.stars(config, folder / "templates.h5", folder / "stars.h5")
+    return read_product(folder / "stars.h5", "stars")
+
+
+def test_drawn_stamps_are_framed_in_the_fields_that_are_asked_for(product):
+    """The brightest pixel, or one that is as bright, is within the centring error of the middle."""
+    config = load_stage(SIMULATION, WORDS)
+    fields = np.arange(9) % 2 == 0
+    stamps, position = FreshStars.simulate(config, 1, 27, fields).draw(
+        400, np.random.default_rng(6)
+    )
+    assert stamps.sum(axis=1) == pytest.approx(1.0, abs=1e-5)
+    assert set(position @ [1, 3]) == {0, 2, 4, 6, 8}
+    images = stamps.reshape(-1, 16, 16)
+    middle = images[:, 7:10, 7:10].max(axis=(1, 2))
+    assert middle == pytest.approx(images.max(axis=(1, 2)), rel=1e-3)
+    # All centring errors occur.
+    pixels = images[:, 7:10, 7:10].reshape(-1, 9).argmax(axis=1)
+    assert np.bincount(pixels, minlength=9).min() > 20
+
+
+def test_drawn_stamps_of_turbulence_are_the_static_psfs_of_their_fields():
+    words = ("dataset=dataset8", "preset=smoke", "grid.points=2", "wavefront.waves=64")
+    config, fields = load_stage(SIMULATION, words), np.array([True, True, False, True])
+    stamps, position = FreshStars.simulate(config, 0, 10, fields).draw(60, np.random.default_rng(8))
+    number = position @ [1, 2]
+    assert set(number) == {0, 1, 3}
+    static = propagate_static_psfs(config).reshape(4, 9, -1)
+    distance = np.abs(stamps[:, None] - static[number]).max(axis=2)
+    assert distance.min(axis=1) == pytest.approx(0.0, abs=1e-6)
+    # Every centring error occurs, and other fields have other PSFs.
+    assert set(distance.argmin(axis=1)) == set(range(9))
+    assert np.abs(stamps[:, None] - static[number - 1]).max(axis=2).min() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["posterior_network", "posterior_network_position"])
+def test_training_lowers_the_error_and_calibrates_sigma(product, name, tmp_path):
+    kind = method(name)
+    reads = ("seed", "noise", "parts", "posterior_network")
+    words = (*WORDS, "noise.levels=[0.001,0.003]", "posterior_network.stars=90")
+    words += ("posterior_network.steps=150", "posterior_network.batch=128")
+    words += ("posterior_network.width=256", "posterior_network.hidden=256")
+    words += ("posterior_network.lr=0.006",)
+    config = load_stage(reads, words)
+    data = training_set(config, kind, product, "random", "realisation", checkpoint=tmp_path / "c")
+    fitted = kind.fit(data, **kind.settings(config))
+    # Without training, the network is the linear estimate.
+    settings = config.posterior_network
+    untrained = settings.model_copy(update={"epochs": 1, "steps": 1, "lr": 1e-9})
+    linear, trained = (
+        fit.diagnostic_rows["history.csv"][-1]["validation_mse"]
+        for fit in (kind.fit(data, untrained), fitted)
+    )
+    assert 0.3 * linear < trained < 0.9 * linear
+    # A saved network gives the same PSFs, and σ holds 68 % of the errors of unused stars.
+    fitted.save(tmp_path / "fit.h5", config.model_dump())
+    loaded = kind.load(tmp_path / "fit.h5")
+    level = np.full(90, data.levels[-1])
+    noisy = data.noise.draw(data.images, level[0], np.random.default_rng(7))
+    estimate = fitted.estimate(noisy, level, data.positions)
+    assert np.array_equal(estimate.psf, loaded.estimate(noisy, level, data.positions).psf)
+    coverage = (np.abs(estimate.psf - data.images) < estimate.sigma).mean()
+    assert coverage == pytest.approx(0.68, abs=0.06)
+    # The same seed gives the same network.
+    short = settings.model_copy(update={"epochs": 1, "steps": 5})
+    once, again = (kind.fit(data, short).estimate(noisy, level, data.positions) for _ in range(2))
+    assert np.array_equal(once.psf, again.psf)
+    assert np.array_equal(once.sigma, again.sigma)
+
+
+def test_stars_of_an_image_and_templates_are_rejected(product, tmp_path):
+    kind = method("posterior_network")
+    config = load_stage(("seed", "noise", "parts", "posterior_network"), WORDS)
+    data = training_set(config, kind, product, "random", "realisation")
+    with pytest.raises(FitError, match="needs stars of a simulation"):
+        kind.fit(replace(data, simulation={}), **kind.settings(config))
+    with pytest.raises(FitError, match="reference=template"):
+        kind.fit(replace(data, reference="template"), **kind.settings(config))
+
+
+def test_networks_are_timed_only_on_request():
+    points, config = load_points(), load(["dataset=dataset3"])
+    assert points.networks == ["posterior_network", "posterior_network_position"]
+    assert set(points.networks).isdisjoint({*points.further_methods, *config.methods})
+    assert "configured" in points.overrides("dataset3", "posterior_network")
