@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from astropy.wcs import WCS
     from batoid import CompoundOptic
     from h5py import Dataset, File
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, FigureBase
+    from matplotlib.image import AxesImage
     from pandas import DataFrame
     from photutils.psf import GriddedPSFModel
     from scipy.sparse import csc_array
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.nn import Module
 else:
+    Artist = AxesImage = FigureBase = Any
     BaseCoordinateFrame = SkyCoord = BinTableHDU = HDUList = Header = ImageHDU = PrimaryHDU = Any
     CCDData = NDData = Column = QTable = Table = Quantity = UnitBase = WCS = Any
     Dataset = File = Axes = LineCollection = Figure = DataFrame = GriddedPSFModel = Any
@@ -34,7 +37,9 @@ else:
 
 __all__ = [
     "WCS",
+    "Artist",
     "Axes",
+    "AxesImage",
     "BaseCoordinateFrame",
     "BinTableHDU",
     "CCDData",
@@ -43,6 +48,7 @@ __all__ = [
     "DataFrame",
     "Dataset",
     "Figure",
+    "FigureBase",
     "File",
     "GriddedPSFModel",
     "HDUList",

@@ -8,20 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
+from psfdae.base.types import Axes, AxesImage, Figure, FigureBase
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.evaluation import drawing
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
-    from matplotlib.image import AxesImage
 
 
 def parameter_label(parameter: str) -> str:

@@ -7,7 +7,6 @@ Rows of other datasets in these tables are not drawn.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -21,16 +20,12 @@ from psfdae.base.figures import (
     draw_row,
     new_figure,
 )
+from psfdae.base.types import Artist, Axes, Figure
 from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae_paper.configuration.methods import list_methods
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Panel, Style
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MEANS: dict[str, Style] = {
     "bayes": {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"},

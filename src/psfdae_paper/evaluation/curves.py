@@ -7,19 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
+from psfdae.base.types import Figure
 from psfdae_paper.evaluation import drawing
 from psfdae_paper.evaluation.drawing import Style
 from psfdae_paper.evaluation.paper import read_paper_names
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 WHOLE_STAMPS: Style = {"lw": 1.2, "ls": "--", "marker": "s", "ms": 2.5}
 """Line of training errors that the validation can be compared with; it may be a single epoch."""

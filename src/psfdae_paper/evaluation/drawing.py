@@ -7,20 +7,16 @@ method, and a legend below all of them.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import new_figure
+from psfdae.base.types import Artist, Axes, Figure
 from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae_paper.configuration.methods import sort_oracles_last
-
-if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 METRIC_LABELS = {
     "mse": "MSE per pixel (stamp sum = 1)",

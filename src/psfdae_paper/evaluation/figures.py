@@ -8,17 +8,12 @@ field are both drawn with y upwards.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from psfdae.base.figures import STAMP_MAP, apply_style, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
+from psfdae.base.types import Axes, AxesImage, Figure
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,18 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psfdae.base.figures import SERIES_COLORS, StripRow, apply_style, new_figure, restoration_strip
 from psfdae.base.files import ProductError
 from psfdae.base.reading import read_table
+from psfdae.base.types import DataFrame, Figure
 from psfdae.image.tables import html_table
 from psfdae.report.page import image_tag
 from psfdae.stars.moments import SIGMA_OF_MAD
 from psfdae_paper.stars.nights import PLACES
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 VERDICTS = ("good", "poor", "failed")
 """Good images, those with a model that are unlike their neighbours in time, those without one."""

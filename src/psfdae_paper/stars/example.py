@@ -12,20 +12,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.files import atomic_path, write_fits
 from psfdae.base.rng import stream
+from psfdae.base.types import WCS
 from psfdae.image.stamps import central_pixel
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import MONOMIALS, seidel_wavefronts
 from psfdae.stars.noise import noise_equivalent_px
-
-if TYPE_CHECKING:
-    from astropy.wcs import WCS
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.base.rng import stream
+from psfdae.base.types import Table
 from psfdae.stars.moments import measure_shapes
 from psfdae_paper.stars.example import (
     FieldRecipe,
@@ -26,9 +26,6 @@ from psfdae_paper.stars.example import (
     star_images,
     tangent_plane,
 )
-
-if TYPE_CHECKING:
-    from astropy.table import Table
 
 PLACES = {
     "centre": (0.5, 0.5),

@@ -176,5 +176,5 @@ def test_networks_are_runs_with_their_curves_and_errors(results, tmp_path):
         curve = "train_mse" if kind == "dae" else "loss"
         assert float(run.epochs[1][curve]) == history[curve][1]
         assert "uniform_tilt_x_bias_0.002" in run.metrics
-    with pytest.raises(ProductError, match="alignment_errors.csv: no such file"):
+    with pytest.raises(ProductError, match=r"alignment_errors\.csv: no such file"):
         read_alignment_runs(tmp_path)
