@@ -264,7 +264,7 @@ def correlate_sources(
     source, *neighbours = (windows[row + down, column + across] for down, across in [(0, 0), *lags])
     # Products of a source with itself; the noise of 81 pixels adds its own.
     products = np.array([(source * pixels).sum(axis=(1, 2)) for pixels in (source, *neighbours)])
-    products -= source[0].size * np.append(1.0, noise_correlations)[:, None]
+    products -= np.prod(windows.shape[-2:]) * np.append(1.0, noise_correlations)[:, None]
     products = products[:, np.isfinite(products).all(axis=0)]
     if products.shape[1] < 5:
         return np.ones(len(lags))
