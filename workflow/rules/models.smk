@@ -84,6 +84,46 @@ use rule train as fit_gmm_position with:
         "Fitting the Gaussian mixture with positions to {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
 
 
+use rule train as fit_posterior_network with:
+    input:
+        unpack(fits.start_files(RUN, "posterior_network")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "posterior_network"),
+    log:
+        f"{RESULTS}/logs/fit_posterior_network/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_posterior_network/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("posterior_network")["runtime"]
+    threads: fits.fit_threads(RUN, "posterior_network")
+    resources:
+        **fits.fit_resources("posterior_network"),
+    params:
+        **fits.fit_params(RUN, "posterior_network"),
+    message:
+        "Training the posterior network on {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
+use rule train as fit_posterior_network_position with:
+    input:
+        unpack(fits.start_files(RUN, "posterior_network_position")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "posterior_network_position"),
+    log:
+        f"{RESULTS}/logs/fit_posterior_network_position/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_posterior_network_position/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("posterior_network_position")["runtime"]
+    threads: fits.fit_threads(RUN, "posterior_network_position")
+    resources:
+        **fits.fit_resources("posterior_network_position"),
+    params:
+        **fits.fit_params(RUN, "posterior_network_position"),
+    message:
+        "Training the posterior network with positions on {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
 use rule train as fit_field with:
     input:
         unpack(fits.start_files(RUN, "field")),
