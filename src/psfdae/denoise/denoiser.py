@@ -38,7 +38,7 @@ from psfdae.stars.bright_stars import magnitude
 from psfdae.stars.moments import measure_shapes
 
 SNR_TOLERANCE = 1.25
-"""Tolerance of the S/N range of the training, a factor: the S/N of a star has an error itself."""
+"""Factor by which a S/N may be outside the range of the training: it has an error itself."""
 
 MAX_CHI2 = 10.0
 """Largest reduced χ² of a star without the flag POOR_FIT."""
@@ -58,9 +58,11 @@ class CentredStars(NamedTuple):
     shift : ndarray of int, shape (n, 2)
         Pixels by which the stars were moved, (row, column).
     flags : ndarray of uint16, shape (n,)
+        Flags of the list, of pixels and of centring.
     border_level : ndarray, shape (n,)
         Median of the border of a stamp, a rough sky.
     photometry : Photometry
+        Flux, sky and noise by the mean PSF, and stamps above the sky of flux 1.
     """
 
     stars: Stamps
@@ -80,9 +82,10 @@ class CentredStars(NamedTuple):
         data : ndarray, shape (n, d, d), float64
             0 in stamps that are unusable.
         noise : ndarray, shape (n,)
-            Standard deviation of a pixel, as sums of pixels have it.
+            Standard deviation of a pixel by sky and photons, larger where pixels share noise.
         is_unusable : ndarray of bool, shape (n,)
-            True if a stamp has nothing to measure: bad, constant, or beyond any number.
+            True if a stamp has nothing to measure: too many bad pixels, no contrast, or pixels or
+            noise that are not finite.
         """
         photometry, stamps, bad = self.photometry, self.stamps, self.bad
         # Bad pixels as the photometry repaired them, or the level of the border where it could not.
@@ -96,14 +99,14 @@ class CentredStars(NamedTuple):
             is_unmeasured[:, None, None], np.where(bad, level, stamps), filled_stamps
         )
         data = np.where(photometry.is_used & ~bad, stamps, filled_stamps).astype(np.float64) - level
-        # Stamps need as many good pixels as the photometry asks for, and any contrast.
-        modulus = np.abs(data).max(axis=(1, 2))
+        # Stamps need as many good pixels as the photometry asks for, and some contrast.
+        largest = np.abs(data).max(axis=(1, 2))
         has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
-        is_unusable = ~(has_pixels & (modulus > 0) & np.isfinite(modulus))
+        is_unusable = ~(has_pixels & (largest > 0) & np.isfinite(largest))
         is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
         data = np.where(is_unusable[:, None, None], 0.0, data)
         # σ² of a pixel: the sky's, as it is in sums of pixels, and the mean of the star's photons.
-        noise = np.fmax(self.stars.noise_correlation * photometry.noise, NOISE_FLOOR * modulus)
+        noise = np.fmax(self.stars.noise_correlation * photometry.noise, NOISE_FLOOR * largest)
         photons = np.maximum(photometry.flux, 0.0) / self.stars.gain / stamps[0].size
         noise = np.where(is_unusable, 1.0, np.sqrt(noise**2 + np.nan_to_num(photons)))
         return data, noise, is_unusable
@@ -121,6 +124,7 @@ class DenoisedStars(NamedTuple):
     photometry : Photometry
         Fluxes and skies by the method where it measures them.
     has_no_flux : ndarray of bool, shape (n,)
+        True for stars whose flux cannot be used, which get the flag NO_FLUX.
     outlier_score : ndarray, shape (n,)
         How unlike all training stars a star is; NaN for a method without a score.
     centre : ndarray, shape (n, 2)
@@ -185,7 +189,7 @@ class Denoiser(ABC):
         # Stamps of more than 32 px come in smaller blocks.
         pixels = bundle.info.stamp_px**2
         self.block_size = min(packing.batch_size, max(1, packing.batch_size * 32**2 // pixels))
-        # A network rounds otherwise if it computes another number of stars together.
+        # A network rounds in another way if it computes another number of stars together.
         self._padded_count = self.block_size if packing.is_padded else 1
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
         self.wings: Wings | None = bundle.wings
@@ -207,8 +211,8 @@ class Denoiser(ABC):
         """
         count = len(stars)
         if count < self._padded_count:
-            # Stars repeated up to that number, which are dropped again; a blank one if there is
-            # none.
+            # Stars are repeated up to that number, and these are dropped again; without a star,
+            # blank ones are taken.
             columns = (getattr(stars, column.name) for column in fields(stars))
             size = self._padded_count
             stars = Stamps(*(np.resize(values, (size, *values.shape[1:])) for values in columns))
@@ -274,7 +278,7 @@ class Denoiser(ABC):
             denoised_stars.photometry,
         )
         psf, sigma = denoised_stars.psf, denoised_stars.sigma
-        # Noise over the flux: the unit of the training, on which errors and limits depend. PSFs and
+        # Noise divided by the flux, as in the training: errors and limits depend on it. PSFs and
         # fluxes are sums of pixels, which have more noise where pixels share it.
         noise = photometry.noise / np.where(denoised_stars.has_no_flux, np.nan, photometry.flux)
         noise *= stars.noise_correlation
@@ -305,7 +309,7 @@ class Denoiser(ABC):
         raise_flag(flags, StarFlag.SNR_HIGH, self.has_snr_max & is_bright)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, is_unlike)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MAX_CHI2)
-        # One entry for each column; their order is as in `psfdae.image.tables.COLUMNS`.
+        # One entry for each column; `Prediction` orders them.
         columns = {
             "id": stars.id,
             "x": stars.x,
@@ -369,8 +373,9 @@ class StampDenoiser(Denoiser):
         photometry = Photometry.join([part.photometry for part in centred_stars])
         has_no_flux = (photometry.flags & StarFlag.NO_FLUX) > 0
         has_flux = ~has_no_flux
-        # Factors of the fluxes, between 1/2 and 2; more would not be a correction. A method is
-        # given the noise of images of flux 1 as the level of its training, λ = σ/(F κ).
+        # Stars whose flux and sky are both estimates get a factor of the flux, between 1/2 and 2;
+        # more would not be a correction. A method is given the noise of images of flux 1 as a noise
+        # level of its training, λ = σ/(F κ).
         near_clusters: dict[str, Any] = {}
         is_free = has_flux & np.concatenate(
             [np.isnan(part.stars.flux) & np.isnan(part.stars.background) for part in centred_stars]
@@ -378,17 +383,17 @@ class StampDenoiser(Denoiser):
         if is_free.any() and self.method.finds_flux:
             # √(noise² + floor²): what the method does not know of a star counts as noise.
             images, noise = self._normalise(photometry, has_no_flux)
-            level = np.hypot(noise, self.bundle.errors.noise_floor) / info.kappa
-            factor, near_clusters["near_clusters"] = self._free_flux.flux(images, level)
+            noise_level = np.hypot(noise, self.bundle.errors.noise_floor) / info.kappa
+            factor, near_clusters["near_clusters"] = self._free_flux.flux(images, noise_level)
             is_free &= np.isfinite(factor)  # a damaged model may find none
             photometry = photometry.scale_flux(np.where(is_free, np.clip(factor, 0.5, 2.0), 1.0))
         psf, sigma = np.full_like(photometry.images, np.nan), None
         score = np.full(len(has_flux), np.nan)
-        # The PSFs; stars of a catalogue that reaches far beyond the image have all no flux.
+        # The PSFs. All stars may be without a flux, such as a part of a list far off the image.
         if has_flux.any():
             images, noise = self._normalise(photometry, has_no_flux)
-            level = noise / info.kappa
-            estimate = self.method.estimate(images, level, **near_clusters)
+            noise_level = noise / info.kappa
+            estimate = self.method.estimate(images, noise_level, **near_clusters)
             psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
             psf[has_no_flux] = np.nan
             if sigma is not None:
@@ -397,7 +402,7 @@ class StampDenoiser(Denoiser):
             if self.bundle.errors.outlier_limit is not None:
                 clusters = {name: values[has_flux] for name, values in near_clusters.items()}
                 score[has_flux] = self._free_flux.outlier_score(
-                    images[has_flux], level[has_flux], **clusters
+                    images[has_flux], noise_level[has_flux], **clusters
                 )
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred_stars)])
@@ -460,13 +465,13 @@ class FieldDenoiser(Denoiser):
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         position = np.stack([stars.x, stars.y], axis=1)
-        # A wider PSF has more light beyond its stamp.
-        outer_part = outer_shares(self.method.psf_at, position, flux)
-        factor, factor_error = self.wings.total_over_flux(outer_part)
+        # A PSF with more light in the outer part of its stamp has more light beyond it.
+        outer_share = outer_shares(self.method.psf_at, position, flux)
+        factor, factor_error = self.wings.total_over_flux(outer_share)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
         # Light of wings that is even in the stamp is in the sky of a star whose sky is not known.
-        even_light = np.maximum(flux, 0.0) * self.wings.scale(outer_part) * self.wings.profile[0]
+        even_light = np.maximum(flux, 0.0) * self.wings.scale(outer_share) * self.wings.profile[0]
         sky = np.where(np.isnan(stars.background), sky - np.nan_to_num(even_light), sky)
         return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
 
@@ -490,12 +495,12 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
         centred_stars.photometry,
         centred_stars.border_level,
     )
-    # Stamps above the level of their border; the sky that is measured counts from it, too.
+    # Stamps above the level of their border; the measured sky is relative to it, too.
     data, noise, is_unusable = centred_stars.measurable()
-    has_flux = np.isfinite(stars.flux)
+    flux_is_given = np.isfinite(stars.flux)
     # Position, magnitude and colour, on which the PSF depends; a star without a listed magnitude
     # has the magnitude of its flux.
-    flux = np.where(has_flux, stars.flux, photometry.flux)
+    flux = np.where(flux_is_given, stars.flux, photometry.flux)
     star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
     position = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
     # PSF, flux, sky and centre at once; given values are taken unchanged. Centres count from the
@@ -515,24 +520,25 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     assert star_fit is not None and estimate.sigma is not None
     covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, position[:, :2])
     flux_error = np.sqrt(covariance[:, 0, 0])
-    # A flux that was given counts if the photometry could use it, another one above its error.
-    flux = np.where(has_flux, stars.flux, star_fit.flux)
-    is_unmeasured = (photometry.flags & StarFlag.NO_FLUX) > 0
-    has_no_flux = is_unusable | np.where(has_flux, is_unmeasured, ~(flux > flux_error))
+    # A given flux is used unless the photometry refused it, a measured one if it is above its
+    # error.
+    flux = np.where(flux_is_given, stars.flux, star_fit.flux)
+    is_refused = (photometry.flags & StarFlag.NO_FLUX) > 0
+    has_no_flux = is_unusable | np.where(flux_is_given, is_refused, ~(flux > flux_error))
     # Flags on pixels come from the photometry, flags on the flux from the method.
     flags = photometry.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
     raise_flag(flags, StarFlag.NO_FLUX, has_no_flux)
-    is_measured = ~has_flux & ~has_no_flux
-    raise_flag(flags, StarFlag.FAINT, is_measured & is_faint(flux, flux_error))
+    is_own_flux = ~flux_is_given & ~has_no_flux
+    raise_flag(flags, StarFlag.FAINT, is_own_flux & is_faint(flux, flux_error))
     raise_flag(flags, StarFlag.BEYOND, method.is_outside_range(position) & ~has_no_flux)
     # The same photometry with the method's fluxes and skies: images are (x − b) / F.
-    unit = np.where(has_no_flux, 1.0, flux)[:, None, None]
-    images = (data - star_fit.background[:, None, None]) / unit
+    divisor = np.where(has_no_flux, 1.0, flux)[:, None, None]
+    images = (data - star_fit.background[:, None, None]) / divisor
     sky = border_level + star_fit.background
     photometry = replace(
         photometry,
         flux=np.where(is_unusable, np.nan, flux),
-        flux_error=np.where(has_flux | is_unusable, np.nan, flux_error),
+        flux_error=np.where(flux_is_given | is_unusable, np.nan, flux_error),
         background=np.where(is_unusable, photometry.background, sky),
         images=np.where(has_no_flux[:, None, None], 0.0, images).astype(np.float32),
         flags=flags,
@@ -559,11 +565,11 @@ def compute_reduced_chi2(
     noise: np.ndarray,
     gain: np.ndarray,
 ) -> np.ndarray:
-    """Return Σ r²/v over what is expected of it, over pixels that are not NaN, (n,).
+    """Return Σ r²/v divided by its expected value, (n,); sums are over pixels that are not NaN.
 
-    The PSF of a bright star absorbs a part of its noise. If the method knows the σ u of its
-    pixels, in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at least 1 %, of
-    what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+    The PSF of a bright star follows some of its noise. If the method knows the σ u of its pixels,
+    in a noise of the mean variance s, the fraction k = 1 − u²/s of the noise of each, at least 1 %,
+    is left in the residual. Σ (s k + k² (v − s))/v is expected then, else the number of pixels.
 
     Parameters
     ----------
@@ -577,15 +583,17 @@ def compute_reduced_chi2(
     # v = σ² + PSF/gain, where the gain is known.
     variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
-        per_electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]
-        variance = variance + np.maximum(psf, 0.0) * per_electron
+        electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]  # in the unit of the stamps
+        variance = variance + np.maximum(psf, 0.0) * electron
     # What is expected of r²/v in each pixel: 1, or less by what the star follows of its own noise.
     is_used = np.isfinite(residual) & np.isfinite(variance)
     expected_square = np.ones(residual.shape)
     if flux_sigma is not None:
         mean_variance = variance.mean(axis=(1, 2), keepdims=True)
-        part = np.clip(1.0 - flux_sigma.astype(np.float64) ** 2 / mean_variance, 0.01, 1.0)
-        expected_square = part * (mean_variance + part * (variance - mean_variance)) / variance
+        fraction = np.clip(1.0 - flux_sigma.astype(np.float64) ** 2 / mean_variance, 0.01, 1.0)
+        expected_square = (
+            fraction * (mean_variance + fraction * (variance - mean_variance)) / variance
+        )
     total, expected_total = (
         np.where(is_used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
         for values in (np.square(residual / np.sqrt(variance)), expected_square)

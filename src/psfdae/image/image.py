@@ -36,6 +36,8 @@ class PixelCache:
         The bad pixels, once they are found.
     sky : Sky or None
         The sky, once it is measured; of several images, only the last one's is kept.
+    last : list of PixelCache
+        The cache that holds a sky, the same list for all caches; empty before the first sky.
     """
 
     bad_pixels: BadPixels | None = None
@@ -61,8 +63,8 @@ class Image(Observation):
     noise_map : NoiseMap or None
         Map of the noise of the pixels.
     neighbour_light : callable or None
-        Returns the light of other stars in the stamps of a part of the list, for a side and a
-        margin in px; it is subtracted.
+        Function of a slice of the stars, a side and a margin in px; it returns the light of other
+        stars in the stamps of these, which is subtracted.
     cache : PixelCache
         Bad pixels and sky, once they are measured.
 
@@ -88,7 +90,8 @@ class Image(Observation):
 
     def _read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Return the image (h, w), its masked pixels, and σ of all pixels if there is a map."""
-        # Pixels without a number, of the mask, or without noise in its map are masked.
+        # Pixels without a number, of the mask, or without noise in its map are masked. σ has the
+        # photons of the stars, whose light is not known before the sky is.
         image, sigma = self.data.read(), None
         bad = ~np.isfinite(image)
         if self.mask is not None:
@@ -115,7 +118,7 @@ class Image(Observation):
         return self.cache.bad_pixels
 
     def sky(self) -> Sky:
-        """Return the whole image with its sky, in the unit of the image times `unit_factor`.
+        """Return the sky and the image without it, in the unit of the image times `unit_factor`.
 
         Raises
         ------
@@ -125,12 +128,13 @@ class Image(Observation):
         return self.cache.sky or self.cache.keep_sky(self._measure_sky())
 
     def _measure_sky(self) -> Sky:
-        """Measure the sky without bad pixels, in units of the map of σ if there is one."""
+        """Measure the sky without bad pixels; its noise is a map of σ, scaled, if there is one."""
         image, is_masked, sigma = self._read()
         with task("sky", 2) as advance, silent():
             bad_pixels = self._find_bad_pixels(image, is_masked)
             advance(1, "bad pixels")
-            # A sky that was measured to find trails is used once: it takes much memory.
+            # The sky that was measured to find trails is used here and not kept: it takes much
+            # memory.
             self.cache.bad_pixels = replace(bad_pixels, sky=None)
             try:
                 least_noise = self.least_noise * self.unit_factor
@@ -175,17 +179,17 @@ class Image(Observation):
         """
         if self.catalogue is None:
             return
-        # Known positions that lie on pixels of a source.
-        indices = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        # Known positions that lie on pixels of a source; unknown ones are off the image.
+        known_count = int(np.isfinite(self.positions).all(axis=1).sum())
         sky = self.sky()
         with silent():
             column, row = central_pixel(self.positions.T)
             # 2 σ above the sky is a source.
             hits = int(is_on_source(sky, column, row, 2.0).sum())
-        if hits < 0.5 * indices.size:
+        if hits < 0.5 * known_count:
             raise ObservationError(
                 self.catalogue,
-                f"{hits} of {indices.size} positions are on a source of {self.path}, at least half "
+                f"{hits} of {known_count} positions are on a source of {self.path}, at least half "
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
 
@@ -219,16 +223,17 @@ class Image(Observation):
         raw = data
         if self.neighbour_light is not None:
             # Saturated pixels are not changed, so that they are flagged.
-            full = np.inf if self.saturate is None else self.saturate
+            limit = np.inf if self.saturate is None else self.saturate
             single_stars = data - self.neighbour_light(part, stamp_px, margin)
-            data = np.where(data >= full, data, single_stars)
+            data = np.where(data >= limit, data, single_stars)
         # Pixels that are off the image or masked.
         is_masked = ~inside | (cut_image(self.bad_pixels.mask, *window)[0] != 0)
-        # The stamp with its own margin, within the wider window.
+        # The stamp with its own margin, within the wider cut.
         side = slice(margin - self.margin, margin + stamp_px + self.margin)
         stamp = np.s_[:, side, side]
         if noise is not None and self.noise_map is not None:
-            # σ of the sky from the map, without the photons of the star.
+            # σ of the sky from the map, without the photons of all stars, also of those that were
+            # subtracted.
             light: np.ndarray | float = 0.0
             if self.noise_map.photons:
                 level, _ = sky_around(raw, is_masked, stamp_px)

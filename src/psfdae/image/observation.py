@@ -38,9 +38,9 @@ class ListedStars(NamedTuple):
     Attributes
     ----------
     id : ndarray, shape (n,), int64 or str
-        Identifiers from the list, or numbers from 0.
+        Identifiers from the list, or numbers of its rows from 0.
     row : ndarray of int, shape (n,)
-        Row of the list.
+        Row of the list, from 0.
     flux, background, colour : ndarray, shape (n,)
         Flux inside the stamp, sky per pixel, and colour, from the columns that the user names.
     flags : ndarray, shape (n,), uint16
@@ -78,7 +78,8 @@ class Observation(ABC):
     camera : dict of str to CameraValue
         Pixel scale, gain, read noise and saturation, in this order.
     least_noise : float
-        Read noise in counts; 0 where it or the gain of the header is not known.
+        Read noise in counts, below which no measured noise counts; 0 where it or the gain of the
+        header is not known.
     noise_correlation : float
         Ratio of the noise of sums of pixels to the noise of sums of independent ones, at least 1.
     stars : ListedStars
@@ -176,11 +177,14 @@ class Observation(ABC):
 
     @property
     def unit_factor(self) -> float:
-        """Factor from the unit of the image, which stamps have, to the unit of its sky."""
+        """Factor from the unit of the image, which stamps have, to the unit of `Image.sky`."""
         return self.data.unit_factor
 
     def to_image_unit(self, values: np.ndarray) -> np.ndarray:
-        """Return values in the unit of the image, in double precision if the sky has another."""
+        """Return values that are in the unit of the sky in the unit of the image.
+
+        They become double precision if these units differ.
+        """
         return values if self.unit_factor == 1.0 else values / np.float64(self.unit_factor)
 
     @property
@@ -233,7 +237,7 @@ class Observation(ABC):
         return ()
 
     def lacks_position(self) -> np.ndarray:
-        """Return True for stars without a position in a list that has others, shape (n,).
+        """Return True for stars of a list with positions that have none themselves, shape (n,).
 
         Detected stars all have one, and a cube need not have any.
         """
@@ -309,7 +313,8 @@ class Observation(ABC):
         flagged_stars : mapping
             Stars (n,), bool, by the flag that they get.
         """
-        # A pixel of +inf is saturated, one of NaN is not.
+        # Before infinite pixels become 0: where a saturation is known, +inf is above it, and NaN is
+        # not.
         saturate = self.saturate
         is_saturated = np.zeros(data.shape, dtype=bool) if saturate is None else data >= saturate
         # Pixels without a number are masked, and 0.

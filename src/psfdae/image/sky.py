@@ -27,7 +27,7 @@ from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatt
 
 @dataclass(frozen=True)
 class Sky:
-    """An image (h, w) with its sky subtracted, and the sky, in single precision.
+    """Sky of an image (h, w), and the image without it, in single precision.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class Sky:
     bad : ndarray of bool, shape (h, w)
         Pixels to ignore.
     noise_scale : float
-        Factor of the map of σ, NaN without one.
+        Factor from the map of σ that was given to `noise`; NaN without a map.
     structure : SkyStructure
-        Steps of the sky's level and of its pixels.
+        Lines at which the level of the sky changes, and step of the pixels in counts.
     notes : tuple of str
         Sentences on unusual properties of the sky.
     """
@@ -61,7 +61,7 @@ class Sky:
         """
         if not self.bad.any():
             return self.bad
-        # Part of the 5 × 5 pixels that is bad.
+        # Fraction of the 5 × 5 pixels that is bad.
         around = scipy.ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
         return np.asarray(self.bad & (around > 0.5))
 
@@ -74,7 +74,7 @@ def subtract_sky(
     known_sky: SkyLevel | None = None,
     structure: SkyStructure | None = None,
 ) -> Sky:
-    """Subtract the sky of an image; return the image with its sky.
+    """Measure the sky of an image; return it, and the image without it.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def subtract_sky(
     least_noise : float
         Lower limit of the noise, in the unit of the image.
     known_sky : SkyLevel, optional
-        Sky of the image, if it was measured before.
+        Sky of the image, if it was measured before; its noise is changed here.
     structure : SkyStructure, optional
         Structure of the sky, if it is known from the image with its stars.
 
@@ -100,10 +100,11 @@ def subtract_sky(
     image = np.where(bad, 0.0, image)
     sky = sky_level(image, bad, structure) if known_sky is None else known_sky
     level, noise, structure, notes = sky
-    # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
+    # Whole counts or simulated images may show no noise. Thresholds are multiples of the noise, and
+    # must not be 0: the limit is about the rounding of a double, and above 0.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
     noise = np.maximum(noise, least_noise, out=noise)
-    # A map of σ is scaled so that its median equals the median of the measured noise.
+    # A map of σ is scaled by the median ratio of the measured noise to it.
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
@@ -119,16 +120,17 @@ class SkySample:
 
     Attributes
     ----------
-    level, noise : float
-        Median over the squares of their median and of their scatter, σ by the median deviation
-        and, where pixels share their noise, the scatter of sums of pixels.
+    level : float
+        Median over the squares of their medians.
+    noise : float
+        Median over the squares of σ by their median deviation, times `correlation`.
     highest : float
         Largest pixel of all squares.
     correlation : float
         Ratio of the noise of sums of pixels to the noise of sums of independent ones, at least 1.
     checker : float
-        Level of the pixels of even rows and columns and of odd ones, less the level of the others,
-        in units of the noise: the contrast of a chessboard.
+        Mean of the pixels whose row and column are both even or both odd, minus the mean of the
+        others, in units of the noise: the contrast of a chessboard.
     """
 
     level: float
@@ -179,8 +181,8 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
                     noises.append(noise)
     if not levels:
         return None
-    # Bands begin at even rows. Stars are clipped at 3 σ; medians would be equal for most whole
-    # counts.
+    # White pixels are found by the parity of row and column, as bands begin at even rows. Means of
+    # values that are clipped at 3 σ, against stars: medians of whole counts would mostly be equal.
     bands = deviations.reshape(-1, columns)
     is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
     white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
@@ -212,13 +214,13 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
         Median of all good pixels if the border has no good pixel; 0 if no pixel is good.
     """
     size = (len(stamps), stamps.shape[-1] ** 2)
-    flat, hidden = stamps.reshape(size), bad.reshape(size)
+    flat, is_bad = stamps.reshape(size), bad.reshape(size)
     ring = border_pixels(stamps.shape[-1])
     # All stamps at once, then those with bad pixels one by one.
     median = np.median(flat[:, ring], axis=1).astype(np.float64)
-    for star in np.flatnonzero(hidden.any(axis=1)):
-        good = flat[star, ring][~hidden[star, ring]]
-        good = good if good.size else flat[star][~hidden[star]]
+    for star in np.flatnonzero(is_bad.any(axis=1)):
+        good = flat[star, ring][~is_bad[star, ring]]
+        good = good if good.size else flat[star][~is_bad[star]]
         median[star] = np.median(good) if good.size else 0.0
     return median
 
@@ -226,14 +228,14 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
 def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
     """Return σ of the pixels in the border of every stamp from their median deviation.
 
-    Light of the star in the border increases it.
+    Light of the star in the border increases it; repaired pixels, which have the median, reduce it.
 
     Parameters
     ----------
     stamps : ndarray, shape (n, s, s)
         Stamps, with or without sky.
     bad : ndarray of bool, shape (n, s, s), optional
-        Pixels that are left out, unless all are bad.
+        Pixels that are left out, unless the whole border is bad.
 
     Returns
     -------
@@ -248,9 +250,9 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     if bad is None:
         return np.asarray(mad_std(ring, axis=1), np.float64)
     # Bad pixels of the ring are left out, unless the whole ring is bad.
-    hidden = bad.reshape(size)[:, border]
-    hidden &= ~hidden.all(axis=1, keepdims=True)
-    ring = np.where(hidden, np.nan, ring)
+    is_bad = bad.reshape(size)[:, border]
+    is_bad &= ~is_bad.all(axis=1, keepdims=True)
+    ring = np.where(is_bad, np.nan, ring)
     return np.asarray(mad_std(ring, axis=1, ignore_nan=True), np.float64)
 
 
@@ -272,7 +274,7 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     Returns
     -------
     level, noise : ndarray, shape (n,)
-        Median and σ, in counts per pixel; 0 where all pixels are bad.
+        Median and σ of a pixel, in the unit of the stamps; 0 where all pixels are bad.
     """
     from astropy.stats import sigma_clipped_stats
 

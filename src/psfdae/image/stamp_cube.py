@@ -20,8 +20,8 @@ from psfdae.stars.moments import robust_scatter
 class StampCube(Observation):
     """Cube (n, s, s) with a stamp of each star, or one stamp (s, s).
 
-    Its attributes are explained in `Observation`; stamps that are larger than a model's have the
-    star in their middle, too.
+    Its attributes are explained in `Observation`. Planes may be larger than `stamp_px` and its
+    margin: the middle of each is cut out.
     """
 
     def replace_margin(self, margin: int) -> Self:
@@ -62,7 +62,8 @@ class StampCube(Observation):
                 is_masked = np.zeros(data.shape, dtype=bool)
                 if mask is not None and mask_pixels is not None:
                     is_masked |= mask.is_bad(self._cut(mask_pixels, part))
-                # The noise is to be estimated, and the list says nothing of centres.
+                # Without a noise map the noise is to be estimated, and a position of the list is in
+                # an image that is not given: it says nothing of the centre in the stamp.
                 noise, centre = np.full(len(data), np.nan), np.full((len(data), 2), np.nan)
                 yield self._build_stamps(part, data, is_masked, noise, centre, {})
 
@@ -81,17 +82,20 @@ def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
     """
     from scipy import ndimage
 
-    # Means of 3 × 3 pixels above the sky, their noise, and their 10th percentile over the planes.
+    # Means of 3 × 3 pixels above the sky, and their noise. Over the planes, their median, and what
+    # nine of ten planes exceed: a star that a few planes lack, such as by a bad pixel, is common.
     smooth = ndimage.uniform_filter(np.nan_to_num(planes), (0, 3, 3))
     smooth -= np.median(smooth, axis=(1, 2), keepdims=True)
     noise = np.median(robust_scatter(smooth.reshape(len(planes), -1).T))
     light, common = np.median(smooth, axis=0), np.percentile(smooth, 10, axis=0, method="lower")
-    # Distance from the middle, and the light at this distance, or opposite if it is more.
+    # Distance from the middle. The star itself has at most the median of the light at this
+    # distance, or the light on the opposite side if it is more.
     offset = np.indices(light.shape) - (np.array(light.shape).reshape(2, 1, 1) - 1) / 2.0
     radius = np.hypot(*offset).astype(int)
     own_light = ndimage.median(light, radius, np.arange(radius.max() + 1))[radius]
     own_light = np.maximum(own_light, light[::-1, ::-1])
-    # Peaks outside the stamp, at least a tenth as high as the highest, are other stars.
+    # Other stars are peaks outside the stamp, above 5 σ, at least a tenth as high as the highest,
+    # and more than 2.5 times as high as the star itself may be there.
     is_star = (np.abs(offset).max(axis=0) > stamp_px / 2) & (common > 5.0 * noise)
     is_star &= light >= np.maximum(ndimage.maximum_filter(light, 5), 0.1 * light.max())
     is_star &= own_light < 0.4 * light

@@ -29,10 +29,11 @@ from psfdae.psf.interface import FieldPsfs, aperture_correction
 from psfdae.psf.wings import Wings, outer_shares
 
 MAX_CHI2_RATIO = 2.5
-"""Median χ² of an image's bright stars, over the training's, from which all are flagged."""
+"""Ratio of the median χ² of an image's bright stars to the training's, above which all stars are
+flagged UNLIKE_TRAINING."""
 
 RESIDUAL_SNR = 4.0
-"""Minimum S/N of a star in the residuals: of 10⁶ pixels of noise, some 25 peaks are higher."""
+"""Minimum S/N of a star in the residuals; noise alone has some 25 higher peaks in 10⁶ pixels."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class CrowdedPhotometry:
     Attributes
     ----------
     model : FieldPsfs
+        Model with which the stars were fitted.
     stars : Table
         A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`
@@ -57,7 +59,8 @@ class CrowdedPhotometry:
     image_wings : Wings or None
         Wings of the image, which faint stars hardly show; None without a star that has light.
     chi2_ratio : float
-        Median χ² of bright stars over the χ² that the training stars would have; NaN if not known.
+        Median of the χ² of bright stars divided by the χ² that training stars of their S/N would
+        have; NaN if not known.
     """
 
     model: FieldPsfs
@@ -69,7 +72,7 @@ class CrowdedPhotometry:
     chi2_ratio: float = np.nan
 
     def times(self, factor: float) -> CrowdedPhotometry:
-        """Return the same in a unit in which all light is larger by a factor."""
+        """Return the same in a unit in which the numbers of all light are larger by a factor."""
         stars = self.stars.copy()
         for name in ("flux", "flux_error", "flux_model"):
             stars[name] *= factor
@@ -84,12 +87,19 @@ class CrowdedPhotometry:
         return half if self.wings is None else float(self.wings.radius_px[-1])
 
     def compute_model_share(self) -> tuple[float, float]:
-        """Return the part of a typical star's flux that is in the stamp, and its standard error."""
+        """Return the fraction of a typical star's flux in the model, and its standard error.
+
+        The rest are the wings, which reach into the stamp, too.
+        """
+        # 1/(1 + L), with the error σ_L/(1 + L)².
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
-        """Return the flux of a star over what an aperture gets; see `psfdae.psf.wings`."""
+        """Return the ratio of the flux of a star to the light in an aperture.
+
+        See `psfdae.psf.interface.aperture_correction`.
+        """
         return aperture_correction(self.model, self.wings, x, y, radius_px)
 
 
@@ -101,7 +111,7 @@ def photometry(
     Parameters
     ----------
     model : FieldPsfs
-        That knows the PSF at every place of this image.
+        Model that knows the PSF at every position in this image.
     observation : Image
         The image with its stars. If they come from a list, no others are searched for.
     threshold : float
@@ -112,13 +122,13 @@ def photometry(
     Raises
     ------
     PredictionError
-        If the model knows no PSF of a place.
+        If the model does not know the PSF at a position.
     ObservationError
         If the sky cannot be measured.
     """
     from scipy.ndimage import map_coordinates
 
-    unit, (gain, limit) = observation.unit_factor, observation.camera_in_sky_unit()
+    unit, (gain, saturate) = observation.unit_factor, observation.camera_in_sky_unit()
     # PSFs of the field, and lengths that follow from the PSF in its middle.
     psfs = PsfGrid.sample(model, by_magnitude=True).times(unit)
     fwhm, side = model.fwhm_px(), model.stamp_px
@@ -130,10 +140,11 @@ def photometry(
     # The image with its sky; saturated pixels are not fitted.
     sky = observation.sky()
     image = sky.signal + sky.level
-    is_saturated = image >= limit
+    is_saturated = image >= saturate
     bad = sky.bad | is_saturated
     sky = replace(sky, bad=bad)
-    # Stars start where the list or the detection has them, with the wings of the model.
+    # Stars start where the list or the detection has them, with the wings of the model. `origin` is
+    # where a star was first expected, `place` where it was fitted last.
     origin, flux = np.array(observation.positions, dtype=np.float64), None
     place = origin
     wings, wing_light = model.wings, np.zeros_like(image)
@@ -150,24 +161,25 @@ def photometry(
         flux = fit.flux
         # Sky and light beyond the stamps, from the image without the light of stars.
         fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
-        # At first, the fluxes have the error of the wings.
+        # The first fluxes are off by the light of unknown wings: it is enough to know these to
+        # their standard error, and to a tenth of it afterwards.
         sky, wing_light, wings, halo_error = around_stars(
             image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, is_saturated
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, gain)
-        # Two fits at least; one more with halos, whose first measurement lacks the light that the
-        # first fluxes have too much.
-        is_last = turn > (1 if halo_error.any() else 0)
-        if turn == turns - 1 or (is_last and observation.detections is None):
+        # Two fits at least. The first fluxes contain light of halos, which the first halos then
+        # lack: if there are any, it is one fit more.
+        may_be_last = turn > (1 if halo_error.any() else 0)
+        if turn == turns - 1 or (may_be_last and observation.detections is None):
             break
         # A star found in residuals is dropped if it is faint, if it may be what the PSF of another
         # star lacks, or if it has moved to another star.
         sigma = np.hypot(fit.flux_error, _psf_doubt(place, flux, side, area_px))
-        real = flux > min(threshold, 3.0) * sigma
-        real[find_duplicates(place, flux, observation.count, 0.5 * fwhm)] = False
-        real[: observation.count] = True
-        place, flux, origin = place[real], flux[real], origin[real]
+        is_real = flux > min(threshold, 3.0) * sigma
+        is_real[find_duplicates(place, flux, observation.count, 0.5 * fwhm)] = False
+        is_real[: observation.count] = True
+        place, flux, origin = place[is_real], flux[is_real], origin[is_real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
         # stars and find none.
         if observation.detections is not None and turn < turns - 2:
@@ -176,11 +188,12 @@ def photometry(
             new, new_flux = find_stars(psfs, sky.signal, sigma, positions, threshold, fwhm)
             place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
             flux = np.append(flux, new_flux)
-        if is_last and real.all() and len(place) == len(real):
+        if may_be_last and is_real.all() and len(place) == len(is_real):
             break
     # Wings of the model, if this image has no star that is bright enough to show them.
     wings_used = wings if wings is not None and wings.is_measured else model.wings
-    # A halo that is off by δ in all pixels of a star changes its flux by δ Σ P / Σ P².
+    # A halo that is off by δ in all pixels of a star changes its flux by δ Σ P / Σ P², which is δ
+    # times the noise-equivalent area 1 / Σ P², as Σ P = 1.
     rows_columns = np.nan_to_num(fit.place[:, ::-1]).T
     light_error = area_px * map_coordinates(halo_error, rows_columns, order=1, mode="nearest")
     stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm, light_error)
@@ -197,20 +210,21 @@ def photometry(
 def find_duplicates(
     place: np.ndarray, flux: np.ndarray, listed_count: int, distance_px: float
 ) -> np.ndarray:
-    """Return the numbers of stars that have moved onto another star, which is kept.
+    """Return the indices of stars that have moved onto another star, which is kept.
 
     Parameters
     ----------
     place : ndarray, shape (n, 2)
-        Positions x and y, the stars of the list first.
+        Positions x and y; stars of the list, or of the first detection, come first.
     flux : ndarray, shape (n,)
         Of two stars that both were found in residuals, the fainter one is the duplicate.
     listed_count : int
-        Number of stars of the list, which come before stars found in residuals.
+        Number of these, which come before stars found in residuals.
     distance_px : float
         Distance within which two stars are one.
     """
     first, second = pairs_within(place, distance_px).T
+    # Of a pair, the star that comes later is the duplicate, or the fainter one if both were found.
     is_first = (first >= listed_count) & (flux[first] < flux[second])
     return np.asarray(np.where(is_first | (second < first), first, second))
 
@@ -237,7 +251,7 @@ def tabulate_stars(
     origin : ndarray, shape (n, 2)
         Expected positions of the stars, x and y in pixels.
     wings : Wings or None
-        Light outside of the stamps; None adds none to the fluxes.
+        Light that the model lacks; None adds none to the fluxes.
     fwhm : float
         FWHM of the PSF in pixels, which groups stars.
     light_error : ndarray, shape (n,)
@@ -245,35 +259,39 @@ def tabulate_stars(
     """
     from astropy.table import Table
 
-    total, total_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
+    # Ratio of all light of a star to its light in the model.
+    total_ratio, ratio_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
         flux = fit.flux / observation.unit_factor
-        total, total_error = wings.total_over_flux(
+        total_ratio, ratio_error = wings.total_over_flux(
             outer_shares(model.draw_on_pixels, fit.place, flux)
         )
     is_detected = observation.detections is not None
-    # With a list, the errors of stars that overlap are larger than this bias, and of either sign.
+    # A centre that follows noise makes a detected star too bright (`JointFit.flux_bias`). With a
+    # list, the errors of stars that overlap are larger than this bias, and of either sign.
     flux = fit.flux - fit.flux_bias if is_detected else fit.flux
     # Light that no model explains, of the PSF's own errors or of undetected stars, is as much
     # in the fluxes as in the residuals.
     excess = np.sqrt(np.fmax(fit.chi2, 1.0))
     # The errors of the PSF and of the wings are not noise, but the same fraction of each flux,
-    # whatever its χ²: σ² = χ² σ_noise² + σ_halo² + (σ_model F)² + (σ_wings F)².
-    relative_error = np.hypot(model.flux_error(fit.place), total_error / total)
+    # whatever its χ²: σ² = max(χ², 1) σ_noise² + σ_halo² + (e_model F)² + (e_wings F)², with the
+    # relative errors e, for the flux F in the model; all light has the same relative error.
+    relative_error = np.hypot(model.flux_error(fit.place), ratio_error / total_ratio)
     # Stars of a list keep its numbers and flags.
     stars = Table({"id": np.arange(1, len(flux) + 1) if is_detected else observation.stars.id})
     stars["x"], stars["y"] = fit.place.T
     stars["x_error"], stars["y_error"] = excess * fit.place_error.T
-    stars["flux"] = total * flux
+    stars["flux"] = total_ratio * flux
     fit_error = np.hypot(excess * fit.flux_error, light_error)
-    stars["flux_error"] = total * np.hypot(fit_error, relative_error * flux)
+    stars["flux_error"] = total_ratio * np.hypot(fit_error, relative_error * flux)
     stars["flux_model"] = flux
     # Chains of neighbours, numbered from 1.
     group = chains(fit.place, 2.4 * fwhm)
     stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
     stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
     stars["flags"] = np.zeros(len(stars), np.uint16) if is_detected else observation.stars.flags
-    # Noise has some peaks below 5 σ in an image of a million pixels: a source may be no star.
+    # Noise has some peaks of up to 5 σ in an image of a million pixels: a detected source below
+    # that may be no star.
     faint = is_faint(np.array(stars["flux"]), np.array(stars["flux_error"]), 5.0)
     raise_flag(stars["flags"], StarFlag.FAINT, faint & is_detected)
     # Farther from where it was expected than noise explains, a star may be another one.
@@ -285,7 +303,7 @@ def tabulate_stars(
 
 
 def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
-    """Return the median of bright stars' χ² over the χ² that the training stars would have.
+    """Return the median ratio of bright stars' χ² to that of training stars of their S/N.
 
     All stars are flagged UNLIKE_TRAINING if it is above `MAX_CHI2_RATIO`.
 
@@ -294,7 +312,7 @@ def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
     fit : JointFit
         All stars of the image, with their χ².
     flags : ndarray, shape (n,)
-        Changed here; bright stars are those without another flag than POOR_FIT.
+        Changed here; bright stars have a S/N above 20 and no flag other than POOR_FIT.
     variance : float
         Variance v of the training stars about their PSF, summed over the noise-equivalent area.
 
@@ -313,9 +331,9 @@ def flag_misfit(fit: JointFit, flags: np.ndarray, variance: float) -> float:
 
 
 def star_flags(
-    stars: Table, bad: np.ndarray, is_saturated: np.ndarray, side: int, fwhm: float
+    stars: Table, bad: np.ndarray, is_saturated: np.ndarray, box_px: int, fwhm: float
 ) -> np.ndarray:
-    """Return the flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
+    """Return the flags (n,), uint16, of stars that were fitted in boxes of `box_px` pixels.
 
     Parameters
     ----------
@@ -323,30 +341,30 @@ def star_flags(
         As in `CrowdedPhotometry`.
     bad, is_saturated : ndarray of bool, shape (h, w)
         Pixels that were not fitted.
-    side : int
+    box_px : int
         Side of the boxes, odd.
     fwhm : float
-        In pixels.
+        FWHM of the PSF in pixels, within which neighbours are blended.
     """
     from scipy.ndimage import maximum_filter
 
     place = np.stack([stars["x"], stars["y"]], axis=1)
     is_located = np.isfinite(place).all(axis=1)
     flags, photutils = np.zeros(len(stars), np.uint16), np.array(stars["photutils_flags"])
-    # Pixels of the box about each star.
+    # Pixels of the box about each star; a star without a position is put off the image.
     height, width = bad.shape
-    column, row = np.rint(np.where(is_located[:, None], place, -side)).astype(int).T
-    half = side // 2
+    column, row = np.rint(np.where(is_located[:, None], place, -box_px)).astype(int).T
+    half = box_px // 2
     edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
     for pixels, flag in ((bad, StarFlag.MASKED), (is_saturated, StarFlag.SATURATED)):
-        raise_flag(flags, flag, is_located & maximum_filter(pixels, side, mode="constant")[at])
+        raise_flag(flags, flag, is_located & maximum_filter(pixels, box_px, mode="constant")[at])
     raise_flag(flags, StarFlag.TRUNCATED, edge & is_located)
     # Flux, fit and neighbours.
     flux, error = np.array(stars["flux"]), np.array(stars["flux_error"])
     raise_flag(flags, StarFlag.NO_FLUX, ~np.isfinite(flux))
     raise_flag(flags, StarFlag.FAINT, is_faint(flux, error))
-    # Not at rest, or a place at its bound.
+    # Flags of photutils: 8, the fit did not converge; 32, a position is at its bound.
     raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > MAX_CHI2) | (photutils & 8 > 0))
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
     raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
@@ -354,15 +372,15 @@ def star_flags(
 
 
 def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
-    """Return the flux (n,) that errors of the PSFs of other stars may make at places (n, 2).
+    """Return the flux (n,) that errors of the PSFs of other stars may cause at each star (n, 2).
 
     A PSF may lack 1.5 % of its light in and about its stamp of `side` pixels, of which a star gets
     what falls on its noise-equivalent area.
     """
-    # Squares of the fluxes of all stars near enough to each star.
-    is_bright = (flux > 0)[:, None]
-    pairs = pairs_within(np.where(is_bright, place, np.nan), 0.75 * side)
+    # Squares of the fluxes of all stars near enough to each star; both stars have light.
+    has_light = (flux > 0)[:, None]
+    pairs = pairs_within(np.where(has_light, place, np.nan), 0.75 * side)
     square = np.zeros(len(place))
-    for first, second in ((0, 1), (1, 0)):
-        np.add.at(square, pairs[:, first], np.square(flux[pairs[:, second]]))
+    for star, other in ((0, 1), (1, 0)):
+        np.add.at(square, pairs[:, star], np.square(flux[pairs[:, other]]))
     return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))

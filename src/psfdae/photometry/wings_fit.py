@@ -22,7 +22,7 @@ from psfdae.stars.moments import dither
 
 
 class StarFluxes(NamedTuple):
-    """Places and fluxes of n stars, in whose light wings are looked for.
+    """Positions and fluxes of n stars, and how wide their PSFs are.
 
     Attributes
     ----------
@@ -32,7 +32,8 @@ class StarFluxes(NamedTuple):
         In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 are
         left out.
     outer_share : ndarray, shape (n,)
-        Part of the light in the outer part of the stamp, as `outer_shares` gives it; NaN: no wings.
+        Fraction of the light in the outer part of the stamp, as `outer_shares` gives it; stars of
+        which it is NaN are left out.
     """
 
     place: np.ndarray
@@ -47,9 +48,10 @@ class StarFluxes(NamedTuple):
 def star_tents(
     rows: slice, width: int, stars: StarFluxes, wings: Wings
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield windows about the 1000 brightest stars, and F s h_k there, shape (K, …).
+    """Yield windows about the 1000 stars of the brightest wings, and F s h_k in them.
 
-    A window is of rows, counted from `rows.start`, and columns; the image is `width` px wide.
+    A window has rows, counted from `rows.start`, and columns; F s h_k has the shape (K, rows,
+    columns). The image is `width` px wide.
     """
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
@@ -89,8 +91,8 @@ def draw_tents(
     for top in steps("wings", range(0, height, 128)):
         rows = slice(top, min(top + 128, height))
         band_tents = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
-        for window, tented_star in star_tents(rows, width, stars, wings):
-            band_tents[:, *window] += tented_star
+        for window, tents_of_star in star_tents(rows, width, stars, wings):
+            band_tents[:, *window] += tents_of_star
         yield rows, band_tents
 
 
@@ -99,8 +101,8 @@ def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -
     # One map, to which each star adds the light in its window.
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
-        for window, tented_star in star_tents(rows, shape[1], stars, wings):
-            image[window] += np.tensordot(wings.profile, tented_star, 1)
+        for window, tents_of_star in star_tents(rows, shape[1], stars, wings):
+            image[window] += np.tensordot(wings.profile, tents_of_star, 1)
     return image
 
 
@@ -114,8 +116,8 @@ def fit_wings(
 ) -> Wings | None:
     """Fit the wings of stars to what is left of an image without sky and models of its stars.
 
-    An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
-    are more than 4 σ from the wings of an `earlier` fit.
+    An even light, such as a wrong level of the sky, is fitted with them and not returned. Pixels
+    that are more than 4 σ from the wings of an `earlier` fit are left out.
 
     Parameters
     ----------
@@ -141,7 +143,7 @@ def fit_wings(
     radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
     if earlier is not None:
         radius = earlier.radius_px
-    # The mean of the outer share by light, for which s = 1.
+    # The mean of the outer share, weighted with the flux: the share for which s = 1.
     flux, outer_share = stars.flux, stars.outer_share
     has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
     if not has_light.any():
@@ -186,7 +188,7 @@ def fit_wings(
     # Least squares of p with its prior, and of the even light without one, in units of the prior's
     # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, χ²
     # of the pixels and χ² of sums over blocks: an uneven sky and undetected sources leave
-    # residuals that neighbours share, as wide as wings.
+    # residuals as wide as wings, in which pixels are not independent.
     prior_profile, prior_sigma = compute_prior_profile(radius, mean_share)
     unit = np.append(prior_sigma, normal[-1, -1] ** -0.5)
     normal, projection = normal * unit * unit[:, None], projection * unit
@@ -212,8 +214,8 @@ def add_model_errors(
 ) -> np.ndarray:
     """Return σ (h, w) of an image without its stars: its noise, and the errors of their models.
 
-    These are 3 % of the models' light and 30 % of the wings': wings are round here; a telescope's
-    may differ from that by as much in a pixel.
+    These are 3 % of the models' light and 30 % of the wings' light: wings are round here, and those
+    of a telescope may differ from that by as much in a pixel.
     """
     return np.asarray(np.hypot(np.hypot(error, 0.03 * star_light), 0.3 * wing_light))
 
@@ -246,7 +248,7 @@ def around_stars(
     earlier : Wings or None
         Wings with which the turns begin.
     tolerance : float
-        Turns end when the light of the wings changes by less than this part of its error.
+        Turns end when the light of the wings changes by less than this fraction of its error.
     is_saturated : ndarray of bool, shape (h, w)
         Saturated pixels.
 
@@ -254,7 +256,7 @@ def around_stars(
     -------
     sky : Sky
         Sky without wings; its `signal` is what is left without sky, stars and wings.
-    light_of_wings : ndarray, shape (h, w)
+    wing_light : ndarray, shape (h, w)
         With the halos of saturated cores.
     wings : Wings or None
     halo_error : ndarray, shape (h, w)
@@ -264,45 +266,45 @@ def around_stars(
     sigma = add_model_errors(error, star_light)
     without_stars = image - star_light
     wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
-    light_of_wings = draw_wings(image.shape, stars, wings)
+    wing_light = draw_wings(image.shape, stars, wings)
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
-    without_light = without_stars - light_of_wings
+    without_light = without_stars - wing_light
     sky = subtract_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
     del without_light
     # The map estimates the mode, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
-    deviation = (without_stars - sky.level - light_of_wings) / sigma
+    deviation = (without_stars - sky.level - wing_light) / sigma
     is_excluded = sky.bad | (np.abs(deviation) > 4.0)
-    # Mean deviation Σ (d/σ)/σ over Σ 1/σ².
+    # Mean deviation Σ d/σ² divided by Σ 1/σ², of deviations d in counts; in place, as maps of a
+    # large image take much memory.
     weight = np.where(is_excluded, 0.0, 1.0 / sigma)
     deviation *= weight
     weight *= weight
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, signal=sky.signal - even_light)
-    halo_error = subtract_halos(
-        sky.signal, light_of_wings, sky.bad, sigma, stars, wings, is_saturated
-    )
-    return sky, light_of_wings, wings, halo_error
+    halo_error = subtract_halos(sky.signal, wing_light, sky.bad, sigma, stars, wings, is_saturated)
+    return sky, wing_light, wings, halo_error
 
 
 def subtract_halos(
     residual: np.ndarray,
-    light_of_wings: np.ndarray,
+    wing_light: np.ndarray,
     bad: np.ndarray,
     sigma: np.ndarray,
     stars: StarFluxes,
     wings: Wings | None,
     is_saturated: np.ndarray,
 ) -> np.ndarray:
-    """Subtract the halos of saturated cores, which the fit of a few pixels does not know.
+    """Subtract the halos of saturated cores, whose stars have no or few pixels to be fitted.
 
-    The wings of stars on the cores are a part of the halos, which need not be round as wings are.
+    The wings of stars on the cores belong to the halos, which need not be round as wings are: they
+    are added to the residual again before halos are measured.
 
     Parameters
     ----------
-    residual, light_of_wings : ndarray, shape (h, w)
+    residual, wing_light : ndarray, shape (h, w)
         Image without sky and stars, and light of wings: changed here.
     bad, is_saturated : ndarray of bool, shape (h, w)
         Pixels that do not count, and saturated ones.
@@ -320,11 +322,11 @@ def subtract_halos(
     """
 
     def move_wings(rows: np.ndarray, sign: float) -> None:
-        """Add wings of some stars to the residual, or subtract them."""
+        """Add wings of the stars of a mask to the residual (`sign` 1), or subtract them (−1)."""
         if rows.any():
             light = sign * draw_wings(residual.shape, stars.select(rows), wings)
             residual[:] += light
-            light_of_wings[:] -= light
+            wing_light[:] -= light
 
     cores, halo_error = find_saturated_cores(is_saturated), np.zeros_like(residual)
     distance = np.hypot(*(stars.place[:, None] - cores[:, :2]).T)
@@ -334,7 +336,7 @@ def subtract_halos(
         if (halo := measure_halo(residual, bad, sigma, core)) is None:
             move_wings(is_on_this, -1.0)  # the wings are all that is known of its light
             continue
-        light_of_wings[halo.window] += halo.light
+        wing_light[halo.window] += halo.light
         residual[halo.window] -= halo.light
         halo_error[halo.window] = np.hypot(halo_error[halo.window], halo.error)
     return halo_error
@@ -388,12 +390,12 @@ def measure_halo(
         for at, size in zip((row, column), residual.shape, strict=True)
     )
     data, noise, middle = residual[window], sigma[window], core[1::-1].astype(float)
-    # Rings wider by a tenth each; `shape` turns ellipses into circles.
+    # Rings wider by a tenth each; `to_circle` turns ellipses into circles.
     edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
-    shape = np.eye(2)
+    to_circle = np.eye(2)
     for _ in range(5):
         offset = np.mgrid[window] - middle[:, None, None]
-        round_offset = np.tensordot(shape, offset, 1)
+        round_offset = np.tensordot(to_circle, offset, 1)
         radius = np.hypot(*round_offset)
         ring = np.where(bad[window], 0, np.digitize(radius, edges))
         # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
@@ -403,19 +405,20 @@ def measure_halo(
         # The error of a median of n values is 1.25 σ/√n.
         level_error = 1.25 * ndimage.mean(noise, ring, numbers)
         level_error /= np.sqrt(np.bincount(ring.ravel())[numbers])
-        # Near the core, in the errors of a fitted star's model, there may be nothing to see.
+        # The halo is the first run of rings that show it: near the core, errors of the model of a
+        # fitted star may hide it.
         is_seen = np.append(np.abs(level) > 5.0 * level_error, False)
         first = int(is_seen.argmax())
-        count = first + int(is_seen[first:].argmin())
-        if count - first < 2:
+        end_ring = first + int(is_seen[first:].argmin())
+        if end_ring - first < 2:
             return None
         # Noise hides the light of farther rings: it goes on along a power of the distance that fits
         # the last four, at least r^-2. Between rings, r³ h is linear in ln r.
-        last = np.s_[max(count - 4, first) : count]
+        last = np.s_[max(end_ring - 4, first) : end_ring]
         slope = min(np.polyfit(log_radius[last], np.log(np.abs(level[last])), 1)[0], -2.0)
-        log_r, end = np.log(np.maximum(radius, 1.0)), log_radius[count - 1]
-        scaled_level = level[:count] * np.exp(3.0 * log_radius[:count])
-        height = np.interp(log_r, log_radius[:count], scaled_level)
+        log_r, end = np.log(np.maximum(radius, 1.0)), log_radius[end_ring - 1]
+        scaled_level = level[:end_ring] * np.exp(3.0 * log_radius[:end_ring])
+        height = np.interp(log_r, log_radius[:end_ring], scaled_level)
         light = height * np.exp(slope * np.maximum(log_r - end, 0.0) - 3.0 * np.minimum(log_r, end))
         light[radius >= 256.0] = 0.0
         # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
@@ -434,17 +437,17 @@ def measure_halo(
         middle += np.clip(change[:2], -1.0, 1.0)
         along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
         stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
-        shape = stretch @ shape
-    # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, √8
-    # times the error of the ring. σ² = their mean square less seven of these; half of the light
-    # outside.
+        to_circle = stretch @ to_circle
+    # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, whose
+    # variance is 8 times the variance e² of the ring's median. σ² is their mean square minus 7 e²,
+    # at least e². Outside of the rings that show the halo, σ is half of the light.
     eighth = np.floor(np.arctan2(*offset) * 4.0 / np.pi).astype(int) % 8
-    parts = numbers[:count, None] * 8 + np.arange(8)
+    parts = numbers[:end_ring, None] * 8 + np.arange(8)
     uneven = ndimage.median(data - light, ring * 8 + eighth, parts.ravel()).reshape(parts.shape)
-    noise_variance = np.square(level_error[:count])
+    noise_variance = np.square(level_error[:end_ring])
     variance = np.nanmean(np.square(uneven), axis=1) - 7.0 * noise_variance
     ring_error = np.sqrt(np.maximum(variance, noise_variance))
-    error = np.interp(log_r, log_radius[:count], ring_error)
+    error = np.interp(log_r, log_radius[:end_ring], ring_error)
     return Halo(window, light, np.where(log_r > end, 0.5 * np.abs(light), error))
 
 
@@ -461,19 +464,19 @@ def _wings_beside(
     from scipy.ndimage import uniform_filter
 
     wings, all_stars = earlier, stars
-    # Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if most
-    # of the 5 × 5 px about it are good, and their RMS residual is below 2 σ, which includes errors
-    # of the PSF.
+    # Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if more
+    # than half of the 5 × 5 px about it are good, and the RMS of these is below 2 σ, where σ has
+    # the errors of the PSF, too.
     residual, bad = without_stars - sky.level, sky.bad
     squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
     mean_square = uniform_filter(squares, 5, mode="constant")
-    good_part = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
+    good_fraction = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
     height, width = bad.shape
     column, row = np.rint(np.nan_to_num(stars.place, nan=-9.0)).astype(int).T
     is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
-    is_star = is_inside & (good_part[at] > 0.5) & (mean_square[at] < 4.0 * good_part[at])
-    del squares, mean_square, good_part  # of a large image, each map takes much memory
+    is_star = is_inside & (good_fraction[at] > 0.5) & (mean_square[at] < 4.0 * good_fraction[at])
+    del squares, mean_square, good_fraction  # of a large image, each map takes much memory
     stars = all_stars._replace(flux=np.where(is_star, all_stars.flux, np.nan))
     unlike_psf = all_stars._replace(flux=np.where(is_star, np.nan, all_stars.flux))
     # Each turn finds the sky without the wings so far, then the wings on this sky.
@@ -484,13 +487,13 @@ def _wings_beside(
             without_wings[bad] = 0.0
             without_wings, _ = dither(without_wings, sky.structure.pixel_step)
             residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
-            # Stars unlike the PSF have wings, too, which would pass for sky: all wings came out too
-            # small.
+            # Stars unlike the PSF have wings, too. Left in the image, these would pass for sky, and
+            # the wings of all stars would come out too small.
             residual -= draw_wings(bad.shape, unlike_psf, previous)
         wings = fit_wings(residual, sigma, bad, stars, stamp_px, previous)
         if wings is None:
             break
-        # Until their light changes by less than a part of its error.
+        # Until their light changes by less than the given fraction of its error.
         light, light_sigma = wings.light()
         if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
             break

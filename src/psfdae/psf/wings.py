@@ -7,7 +7,7 @@ it. The rest is one profile for all stars: a star of flux F has
 
 more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere, tents h_k in ln r times a power of r
 outside of the stamp, r the distance from its centre, and s the light of the model's PSF in the
-outer part of its stamp over the mean of all stars: where the PSF is wider, it has more wings.
+outer part of its stamp divided by the mean of all stars: where the PSF is wider, it has more wings.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class Wings:
         r_1 … r_K: tops of the K − 1 tents, r_1 half the side of the stamp; the light ends at
         r_K.
     profile : ndarray, shape (K,)
-        p_0 … p_{K−1}, part of the flux per pixel: p_0 in the stamp, p_k (r_k/r_1)^-3 at r_k.
+        p_0 … p_{K−1}, fractions of the flux in a pixel: p_0 in the stamp, p_k (r_k/r_1)^-3 at r_k.
     covariance : ndarray, shape (K, K)
-        Of p_k.
+        Covariance of the numbers p of `profile`.
     outer_share : float
         Mean of the stars' `outer_shares`, for which s = 1.
     outer_part_from : float
-        Radius at which the outer part of a stamp begins, over half its side.
+        Radius at which the outer part of a stamp begins, as a fraction of half its side.
     steepness : float
         Power of 1/r in the tents, as of light that mirrors and air scatter.
     """
@@ -93,9 +93,13 @@ class Wings:
         return np.asarray(np.clip(ratio, 0.3, 3.0))
 
     def total_over_flux(self, outer_share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return flux_total over flux of stars with these `outer_shares` (n,), and its error.
+        """Return the ratio of flux_total to flux of stars with these `outer_shares` (n,).
 
-        Both have the shape (n,). Half of the change of wings with the PSF counts as its error.
+        Returns
+        -------
+        ratio, error : ndarray, shape (n,)
+            The ratio, and its standard error. Half of the change of wings with the PSF counts as
+            an error.
         """
         # 1 + s L, with the errors s σ_L and (s − 1) L / 2.
         scale = self.scale(outer_share)
@@ -110,16 +114,17 @@ class Wings:
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Return the light that the model lacks within a radius in px, and its standard error.
 
-        Both are over the star's flux, where s = 1.
+        Both are fractions of the flux of a star with s = 1.
         """
         # ∫ 2π r (h_0 p_0 + Σ h_k p_k) dr.
         half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
-        # Part of a circle outside of the square of side 2 half, the stamp: 4/π arccos(half/r) ≤ 1.
+        # Fraction of a circle outside of the stamp, a square with half the side h:
+        # 4/π arccos(h/r), at most 1.
         outside = np.clip(np.arccos(np.minimum(half / np.maximum(r, half), 1.0)) * 4 / np.pi, 0, 1)
         height = np.concatenate([1.0 - outside[None], outside * tents(r, self.radius_px)])
-        share = np.trapezoid(2 * np.pi * r * height, r, axis=1)
-        return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
+        area = np.trapezoid(2 * np.pi * r * height, r, axis=1)
+        return float(self.profile @ area), float(np.sqrt(area @ self.covariance @ area))
 
     def cards(self) -> list[Card]:
         """Return cards for a FITS header: radius of all light, and part of it in the model."""
@@ -149,8 +154,8 @@ class Wings:
         """Average the wings of several images with one model, weighted by 1/σ² of their light."""
         weight = np.array([wings.light()[1] ** -2.0 for wings in several])
         weight /= weight.sum()
-        # First each profile is rescaled to the mean outer share, with which p grows. The images are
-        # independent: C = Σ w² C_i.
+        # Each profile is rescaled to the mean outer share, to which the p of s = 1 is proportional.
+        # The images are independent: C = Σ w² C_i.
         outer_share = float(weight @ [wings.outer_share for wings in several])
         weight *= [outer_share / wings.outer_share for wings in several]
         profile = np.tensordot(weight, [wings.profile for wings in several], 1)
@@ -159,7 +164,7 @@ class Wings:
 
     @property
     def is_measured(self) -> bool:
-        """True if the pixels of the image made the error of the light smaller than the prior's."""
+        """True if pixels of the image made the error of the light smaller than the prior's."""
         sigma = compute_prior_profile(self.radius_px, self.outer_share)[1]
         return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
@@ -167,11 +172,11 @@ class Wings:
 def outer_shares(
     draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray, flux: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the part of a star's flux in the outer part of its stamp, (n,), at places (n, 2).
+    """Return the fraction of a star's flux in the outer part of its stamp, (n,), at places (n, 2).
 
-    Pixels between 0.7 times half the side of the stamp and half the side count. `draw` makes PSFs
-    (m, d, d) of m stars by their x, y and, if fluxes (n,) in counts are given, magnitude. NaN where
-    a place, x and y in px, or a flux is not known.
+    The outer part is between 0.7 times half the side of the stamp and half the side. `draw` makes
+    PSFs (m, d, d) of m stars by their x, y and, if fluxes (n,) in counts are given, magnitude. The
+    result is NaN where a place, x and y in px, or a flux is not known.
     """
     shares = np.full(len(place), np.nan)
     position = np.rint(place)  # at whole pixels, so that phases do not change the share
@@ -192,7 +197,7 @@ def outer_shares(
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
-    """Return h_1 … at distances r in pixels, shape (K − 1, …), as they are outside of the stamp.
+    """Return h_1 … h_{K−1} at distances r in pixels, (K − 1, …), as they are outside of the stamp.
 
     h_k = max(1 − |ln(r/r_1)/ln(r_2/r_1) − (k − 1)|, 0) (r/r_1)^-3: tops are equidistant in ln r.
     """
@@ -216,13 +221,15 @@ def compute_prior_profile(
     1.5 % of the star's light, spread over the stamp.
     """
     half = radius_px[0]
-    # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
-    outer_integral = Wings.outer_part_from**-3.0 - 1.0
-    edge = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * outer_integral)
+    # a: ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
+    outer_term = Wings.outer_part_from**-3.0 - 1.0
+    edge_light = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * outer_term)
     # The ring, at 1.5 h, was taken for sky: every pixel of the stamp lacks its light.
-    expected_light = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0))
+    expected_profile = edge_light * np.append(
+        1.5**-5.0, (radius_px[:-1] / half) ** (Wings.steepness - 5.0)
+    )
     # ∫ 2π r (r/h)^-3 dr from h on is 2π h².
-    sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
+    sigma = np.hypot(np.full(len(radius_px), 0.5 * edge_light), 1e-3 / (2.0 * np.pi * half**2))
     # The model may have 1.5 % too much or too little light in its stamp.
     sigma[0] = 0.015 / (2.0 * half) ** 2
-    return expected_light, sigma
+    return expected_profile, sigma

@@ -34,7 +34,7 @@ NODES = 8
 """Noise levels at which errors are measured, equidistant in the logarithm."""
 
 COVERAGE = 0.6827
-"""Part of the errors within a half-width; of a normal variable within ± 1 σ."""
+"""Fraction of the errors within a half-width, as of a normal variable within ± 1 σ."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class StarErrors:
     nodes : ndarray, shape (S,)
         Pixel RMS over the flux.
     error : ndarray, shape (S, N, d, d), float32
-        Absolute errors (`HeldOutStars.errors`), in units of the method's σ of the pixel if it has
-        one, else of the flux.
+        Absolute errors (`HeldOutStars.errors`) of N noisy images, in units of the method's σ of the
+        pixel if it has one, else of the flux.
     star : ndarray of int, shape (N,)
-        Star of every error.
+        Index of the star of each image.
     distance : ndarray, shape (S, N)
         Mahalanobis distance of the noisy images.
     outlier_score : ndarray, shape (S, N), or None
@@ -72,11 +72,12 @@ class StarErrors:
         components: int,
         rng: np.random.Generator,
     ) -> StarErrors:
-        """Measure errors and distances of noisy test stars at nodes (S,), pixel RMS over the flux.
+        """Measure errors and distances of noisy test stars at nodes (S,) of the noise.
 
-        Distances are along as many `components` of the flux model.
+        Nodes are the RMS of a pixel divided by the flux. Distances are along the leading
+        `components` of the flux model.
         """
-        # Each star at each node of the noise; all are restored together.
+        # Each star at each node of the noise; all are denoised together.
         draws = [stars.draw(node, rng) for node in nodes]
         noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
         noise = np.repeat(nodes, len(draws[0][1]))
@@ -131,12 +132,13 @@ class StarErrors:
     def outlier_limit(self) -> np.ndarray | None:
         """Return the outlier score that 0.1 % of the stars exceed at every node, shape (S,).
 
-        The excess over a node's median is taken to be as usual at all of them.
+        Scores minus the median of their node, divided by their spread, are taken to have the same
+        distribution at all nodes.
         """
         if self.outlier_score is None:
             return None
-        # Scores are squares of distances; excesses are in units of the median absolute deviation,
-        # so that all nodes together show the 0.1 % tail.
+        # Scores are squares of distances, for which the limit of few stars is made. The excesses of
+        # all nodes together, in units of the median absolute deviation, show the 0.1 % tail.
         few_star_limit = self._few_star_limit(np.sqrt(np.maximum(self.outlier_score, 0.0)))
         median = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - median[:, None]), axis=1)
@@ -146,16 +148,16 @@ class StarErrors:
 
     def distance_limit(self) -> float:
         """Return the distance that 0.1 % of the stars exceed."""
-        # Distances have the noise in their unit: all nodes are used together.
+        # A distance has the noise of its star in its unit: all nodes are used together.
         quantile = float(np.quantile(self.distance, 0.999))
         return max(quantile, float(self._few_star_limit(self.distance).max()))
 
     def _few_star_limit(self, distance: np.ndarray) -> np.ndarray:
-        """Return the least limit (S,) of normal distances (S, N) of as few stars as there are.
+        """Return the smallest limit (S,) that distances (S, N) of n stars allow; 0 for n ≥ 100.
 
-        Few stars do not show what 0.1 % exceed: the limit is for one more star after n normal
-        distances, mean + t (1 + 1/n)^½ σ with t of n − 1 degrees of freedom, at least 2. It is 0
-        for a hundred or more, whose own quantile says it.
+        Few stars do not show which distance 0.1 % exceed. If distances are normally distributed,
+        one more star exceeds mean + t (1 + 1/n)^½ σ with this probability, where t is the quantile
+        of Student's distribution of n − 1 degrees of freedom, at least 2.
         """
         from scipy.stats import t
 
@@ -170,8 +172,8 @@ class StarErrors:
 def noise_nodes(band: np.ndarray) -> np.ndarray:
     """Return the noise levels at which errors are measured, ascending.
 
-    They reach as far as stars go without a flag: fluxes are estimates, and half of the faintest
-    stars look fainter than they are.
+    They cover the S/N of all stars without a flag, which is wider than the `band` of the training
+    by a tolerance: fluxes are estimates, and half of the faintest stars look fainter than they are.
     """
     return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, NODES)
 
@@ -263,16 +265,21 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     centre = centre + images.shape[-1] // 2
 
     def compute_excess(offset: np.ndarray, sigma: np.ndarray) -> float:
-        """Return √(e² − σ²), e the mean of the 68 % quantile and of the 95 % quantile over 1.96."""
-        # e in units of σ; the model's part of e² is the rest.
+        """Return √(e² − σ²), where e is the scatter of the offsets and σ their median error.
+
+        e/σ is the mean of two estimates: the 68 % quantile of |offset|/σ of each star, and the 95 %
+        quantile divided by 1.96. It is 0 where σ explains the scatter.
+        """
+        # e/σ, and σ √((e/σ)² − 1).
         ratio = np.abs(offset) / sigma
         scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, 0.95) / 1.96)
         return float(np.median(sigma) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
     # The errors of the flux, of the sky, and of the centre, both axes together.
-    fitted_flux, *growth = method_fit.estimate_flux_error()
+    fitted_flux, *growth_over_field = method_fit.estimate_flux_error()
     flux = compute_excess((prediction.flux - 1.0)[usable], prediction.flux_error[usable])
-    # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
+    # What the model of a bright star lacks may be fitted as flux or as an even sky: the error of
+    # the sky, summed over the stamp, is not below the error of the flux.
     sky = compute_excess(prediction.background[usable], prediction.background_error[usable])
     sky = max(sky, flux / images[0].size)
     offset = np.concatenate([prediction.y_fit - centre[:, 0], prediction.x_fit - centre[:, 1]])
@@ -280,7 +287,9 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     usable_centres = np.concatenate([usable, usable])
     centre_error = compute_excess(offset[usable_centres], sigma[usable_centres])
     # Few fields are drawn: the flux error is not below the error of a fit on a known sky.
-    model_errors = ModelErrors(max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth)
+    model_errors = ModelErrors(
+        max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth_over_field
+    )
     return replace(errors, model=model_errors)
 
 
@@ -311,7 +320,7 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
 
     Factors depend on the case, on the noise and on the brightness of a pixel.
     """
-    # Noise as the photometry estimates it, and factors, at each node; the last axis is the node.
+    # Noise as the photometry estimates it, and factors; the last axis of all arrays is the node.
     errors, rng = model.bundle.errors, stream(seed, "noise", "calibration", "scales")
     nodes = errors.noise
     node_results = [
@@ -326,10 +335,10 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     for index in np.ndindex(scale.shape[:-1]):
         scale[index] = np.interp(nodes, noise[index[1], index[2]], scale[index])
     flux_scale = np.interp(nodes, noise[1, Estimated.FLUX_AND_SKY], flux_scale)
-    # Errors of a method that measures stars were counted where the noise is estimated alone.
+    # Errors of a method that measures stars were only counted where the noise is estimated too.
     if model.method.knows_field:
         scale[:, 0] = scale[:, 1]
-    # Nodes first, as `ErrorModel` has them.
+    # 68 and 95 % apart, and nodes first, as `ErrorModel` has them.
     scale68, scale95 = np.moveaxis(scale, -1, 1)
     return replace(errors, scale68=scale68, scale95=scale95, flux_scale=flux_scale)
 
@@ -376,7 +385,8 @@ def _scales_at(
         if not usable.any():
             continue
         noise[index] = np.median((prediction.noise / prediction.flux)[usable])
-        # The 95 % half-width is not below the 68 % one, although a single star has no errors.
+        # The 95 % half-width is not below the 68 % one; of a single star without errors, the ratio
+        # is 0.
         over_ratio = error[usable] / np.maximum(prediction.ratio95, 1.0)[usable, None, None]
         for brightness, pixels in enumerate((~is_bright[usable], is_bright[usable])):
             scale[0, *index, brightness] = np.quantile(error[usable][pixels], COVERAGE)
@@ -431,8 +441,8 @@ def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float],
     -------
     callable
         Function of other errors of the same stars (n, d, d), each star once, and of their noise
-        over the flux. It returns the parts `coverage68` and `coverage95` within the half-widths,
-        for either half of the stars by the other half; nothing for a single star.
+        divided by the flux. It returns the fractions `coverage68` and `coverage95` of errors within
+        the half-widths, the mean over both halves of the stars; nothing for a single star.
     """
     # Stars that gave the half-widths would be covered too often: each half is judged by the other.
     count = 1 + int(errors.star.max())
@@ -446,13 +456,13 @@ def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float],
 
     # Each half by the map of the other half, at the noise that is asked for; then their mean.
     def measure_coverage(error: np.ndarray, noise: float) -> dict[str, float]:
-        parts: dict[str, list[float]] = {}
+        coverages: dict[str, list[float]] = {}
         for half, widths in halves:
             for name, maps in widths.items():
                 is_inside = error[half] <= interpolate_at_noise(
                     np.array([noise]), errors.nodes, maps
                 )
-                parts.setdefault(name, []).append(float(is_inside.mean()))
-        return {name: float(np.mean(values)) for name, values in parts.items()}
+                coverages.setdefault(name, []).append(float(is_inside.mean()))
+        return {name: float(np.mean(values)) for name, values in coverages.items()}
 
     return measure_coverage

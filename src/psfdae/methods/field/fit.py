@@ -75,13 +75,13 @@ class FitSettings:
         Width of the window of the first centroids; their largest shift, and the same for stars that
         are rings, in pixels.
     model_error, min_error : float
-        Error of the model relative to a pixel's light, which no polynomial follows; smallest error
-        of a pixel over the flux.
+        Error of the model that no polynomial follows, as a fraction of a pixel's light; smallest
+        error of a pixel as a fraction of the flux.
     outlier_sigma, outlier_chi2 : float
-        Residual in σ above which a pixel has less weight, because it may show a neighbour; χ² over
-        the median above which a star has no weight.
+        Residual in σ at which a pixel has half its weight, because it may show a neighbour; ratio
+        of χ² to the median above which a star has no weight.
     varying_smoothness : float
-        Smoothness of terms that vary over the field, over the smoothness of the constant term.
+        Ratio of the smoothness of terms that vary over the field to that of the constant term.
     ridge : float
         Weight of the squared coefficients in the first round, 1/flux².
     field_change, min_coefficient : float
@@ -129,7 +129,7 @@ class FieldUncertainty(NamedTuple):
     jackknife : sequence of FieldModel
         Fields that scatter as much as fits without each group of stars in turn.
     unknown_light : float
-        Scatter of the light in stamps that the field mistakes for sky, over the flux.
+        Scatter of the light in stamps that the field mistakes for sky, as a fraction of the flux.
     """
 
     bootstrap: Sequence[FieldModel] = ()
@@ -149,7 +149,7 @@ class FieldFit(NamedTuple):
     flux : ndarray, shape (n,)
         Flux of each star in the unit of the images.
     centre : ndarray, shape (n, 2)
-        (row, column) from index s//2.
+        (row, column) from the middle pixel, s//2, of the frame.
     good : ndarray of bool, shape (n,)
         True for stars that are not outliers.
     residual : ndarray, shape (n, s, s)
@@ -193,9 +193,9 @@ class FieldFitter:
     noise : ndarray, shape (n,)
         RMS of the sky noise in a pixel.
     photons : ndarray, shape (n,)
-        Photons per unit of the images.
+        Photons per unit of the images, the gain g of each star.
     place : ndarray, shape (n, 4)
-        x, y, magnitude and colour.
+        x, y, magnitude and colour; NaN where unknown.
     axis : ndarray, shape (s,)
         Coordinates of the pixels along a side of the frame.
     stamp_px, around_px : int
@@ -229,7 +229,11 @@ class FieldFitter:
 
     @classmethod
     def build(cls, stars: BrightStars, background: float, frame_px: int, stamp_px: int) -> Self:
-        """Return the fitter of bright stars; for the parameters see `fit_field`."""
+        """Return the fitter of bright stars; for the parameters see `fit_field`.
+
+        `background` is the number of photons of the sky in a pixel, by which the noise gives the
+        gain.
+        """
         # Range of each coordinate over the stars; (0, 0) for one that no star has.
         finite_columns = [column[np.isfinite(column)] for column in stars.place.T]
         ends = [
@@ -237,14 +241,14 @@ class FieldFitter:
         ]
         low, high = np.transpose(ends)
         images, is_valid = stars.cut_frames(frame_px)
-        # A = 4πσ² of a Gaussian. A ring has no light in its middle: it needs a window as wide as
-        # the radius of its light, 1.4 σ.
+        # σ from the noise-equivalent area of a Gaussian, A = 4πσ². A ring has no light in its
+        # middle: it needs a window as wide as the radius of its light, 1.4 σ.
         sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
         return cls(
             images=images,
             is_valid=is_valid,
             noise=stars.noise,
-            photons=np.sqrt(background) / stars.noise,
+            photons=np.sqrt(background) / stars.noise,  # σ = √B / g
             place=stars.place,
             axis=np.arange(frame_px) - frame_px // 2.0,
             stamp_px=stamp_px,
@@ -262,7 +266,8 @@ class FieldFitter:
     def fit(self, options: FitOptions) -> FieldFit:
         """Fit field, fluxes and centres to all stars in alternation (eq. 2 to 4)."""
         settings, spacing = self.settings, compute_spacing(len(self.axis), options.knots)
-        # Coordinates without influence have a range of zero width, or are left out at the end.
+        # Magnitude and colour, if the PSF does not change with them, get a range of zero width
+        # before one with which it does, and are left out otherwise.
         count = max((1, *options.star_terms)) + 1
         low, high = self.low[:count].copy(), self.high[:count].copy()
         for coordinate in range(2, count):
@@ -275,17 +280,17 @@ class FieldFitter:
         is_usual = self.window_px == settings.window_px
         reach = settings.window_reach_px if is_usual else settings.wide_reach_px
         centre = find_centroids(self.images, start, window, 4, reach)
-        # Weights follow from the expected light of a star, first from the median star. Weights from
-        # its own pixels would be larger where noise makes them fainter, and would bias the wings
-        # (Humphrey, Liu & Buote 2009, ApJ 693, 822).
+        # Weights w = 1/variance follow from the expected light of a star, first from the median
+        # star. Weights from its own pixels would be larger where noise makes them fainter, and
+        # would bias the wings (Humphrey, Liu & Buote 2009, ApJ 693, 822).
         light = np.median(self.images / flux[:, None, None], axis=0)
-        robust_weight, noise = np.ones(self.images.shape), self.pixel_weight(flux, light)
+        robust_weight, pixel_weight = np.ones(self.images.shape), self.pixel_weight(flux, light)
         coefficients: np.ndarray | None = None
         for turn in range(settings.rounds):
             # Splines at given centres and fluxes (eq. 2), then centres and fluxes at given splines
             # (eq. 4).
             data = self.images / flux[:, None, None]
-            weight = noise * robust_weight
+            weight = pixel_weight * robust_weight
             coefficients = self.fit_splines(
                 options, terms, data, weight * good[:, None, None], centre, coefficients
             )
@@ -295,23 +300,23 @@ class FieldFitter:
             )
             # The mean star in the middle of its stamp has the sum 1: a common factor is moved from
             # the splines to the fluxes.
-            middle = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
-            sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
-            total = float(draw_splines(middle, sides, np.zeros((1, 2)), spacing).sum())
+            mean_splines = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
+            stamp_axis = np.arange(self.stamp_px) - self.stamp_px // 2.0
+            total = float(draw_splines(mean_splines, stamp_axis, np.zeros((1, 2)), spacing).sum())
             coefficients, flux = coefficients / total, flux * factor * total
             splines = np.tensordot(terms, coefficients, 1)
             star_images = draw_splines(splines, self.axis, centre, spacing)
             # Each star has the sum 1 in the middle of its stamp, and the same light at every phase:
             # otherwise fluxes and splines could compensate each other (eq. 1a).
-            in_middle = draw_splines(splines, sides, np.zeros((1, 2)), spacing)
-            light = compute_relative_light(splines, np.zeros(1), centre, spacing)
-            light *= in_middle.sum(axis=(1, 2), keepdims=True)
-            flux, star_images = flux * light[:, 0, 0], star_images / light
+            centred_images = draw_splines(splines, stamp_axis, np.zeros((1, 2)), spacing)
+            relative_light = compute_relative_light(splines, np.zeros(1), centre, spacing)
+            relative_light *= centred_images.sum(axis=(1, 2), keepdims=True)
+            flux, star_images = flux * relative_light[:, 0, 0], star_images / relative_light
             residual = np.where(self.is_valid, self.images / flux[:, None, None] - star_images, 0.0)
-            # Outliers: pixels get less weight (Cauchy's weight), stars with a large χ² none. In the
-            # first round, the field is not known well enough to reject stars.
-            noise = self.pixel_weight(flux, star_images)
-            square = residual**2 * noise
+            # Outliers: pixels get less weight (Cauchy's weight 1/(1 + r² w/3²)), stars with a large
+            # χ² none. In the first round, the field is not known well enough to reject stars.
+            pixel_weight = self.pixel_weight(flux, star_images)
+            square = residual**2 * pixel_weight
             chi2 = square.sum(axis=(1, 2)) / np.maximum(self.is_valid.sum(axis=(1, 2)), 1)
             robust_weight = 1.0 / (1.0 + square / settings.outlier_sigma**2)
             if turn:
@@ -326,7 +331,7 @@ class FieldFitter:
 
         `light` is the expected light of stars of flux 1, of each (n, s, s) or of all (s, s).
         """
-        # Noise, and the error (0.02 f)² + (10⁻⁵)² of the model.
+        # The variance of sky and photons, and (0.02 f)² + (10⁻⁵)² of the model's error.
         model_error = self.settings.model_error * np.maximum(light, 0.0)
         variance = self.pixel_variance(flux, light) + model_error**2 + self.settings.min_error**2
         return np.where(self.is_valid, 1.0 / variance, 0.0)
@@ -380,17 +385,17 @@ class FieldFitter:
         if self.prior is not None:
             # Only the difference from the other exposure is fitted, after a stretch and a blur.
             prior_coefficients = deform_splines(self.prior, terms, data, weight, (rows, columns))
-            change = options.change * np.abs(prior_coefficients[0]) + settings.min_coefficient
+            sigma = options.change * np.abs(prior_coefficients[0]) + settings.min_coefficient
             # ρ: a relative change of the coefficient by `options.change` is one σ.
-            ridge[:] = 1.0 / change**2
+            ridge[:] = 1.0 / sigma**2
             ridge[1:] /= settings.varying_change**2
             image = rows @ np.tensordot(terms, prior_coefficients, 1) @ columns.transpose(0, 2, 1)
             data = data - image
         elif start is not None:
             # Changes over the field are relative to the mean star of the previous round.
-            change = settings.field_change * np.abs(start[0]) + settings.min_coefficient
-            ridge[1:] = 1.0 / change**2
-        # Iterations begin at the coefficients of the previous round.
+            sigma = settings.field_change * np.abs(start[0]) + settings.min_coefficient
+            ridge[1:] = 1.0 / sigma**2
+        # Iterations begin at the coefficients of the previous round, here minus the prior ones.
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(
