@@ -254,7 +254,7 @@ class Denoiser(ABC):
         # A sky that is given and is more than 5 σ off the sky of the border is flagged.
         border_level = border_median(stamps, bad)
         if np.isfinite(stars.background).any():
-            limit = 5.0 * border_scatter(stamps)
+            limit = 5.0 * border_scatter(stamps, bad)
             raise_flag(flags, StarFlag.SKY_OFF, np.abs(border_level - stars.background) > limit)
         photometry = self._photometer.measure(stamps, bad, border_level, stars)
         return CentredStars(

@@ -227,8 +227,8 @@ class ErrorModel:
         half_width = interpolate_at_noise(noise, self.noise, self.half_width68)
         if sigma is not None:
             half_width = half_width * sigma
-        # The half-width of 95 %, as a multiple of the half-width of 68 %.
-        ratio95 = np.interp(noise, self.noise, self.ratio95)
+        # The half-width of 95 %, as a multiple of the half-width of 68 %, which it contains.
+        ratio95 = np.maximum(np.interp(noise, self.noise, self.ratio95), 1.0)
         # Factors of the case of each star, for faint and bright pixels, shape (n, 2).
         estimates_noise, estimates_flux, estimates_sky = (
             np.isnan(values) for values in (stars.noise, stars.flux, stars.background)

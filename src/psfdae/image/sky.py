@@ -39,6 +39,8 @@ class Sky:
         Pixels to ignore.
     noise_scale : float
         Factor from the map of σ that was given to `noise`; NaN without a map.
+    least_noise : float
+        Lower limit of `noise`, in the unit of the image.
     structure : SkyStructure
         Lines at which the level of the sky changes, and step of the pixels in counts.
     notes : tuple of str
@@ -50,6 +52,7 @@ class Sky:
     noise: np.ndarray
     bad: np.ndarray
     noise_scale: float
+    least_noise: float = 0.0
     structure: SkyStructure = field(default_factory=SkyStructure)
     notes: tuple[str, ...] = ()
 
@@ -111,7 +114,7 @@ def subtract_sky(
         # Bad pixels, for which the map may lack σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
     signal = fill_bad((image - level).astype(np.float32), bad)[0]
-    return Sky(signal, level, noise, bad, scale, structure, notes)
+    return Sky(signal, level, noise, bad, scale, least_noise, structure, notes)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from psfdae.photometry.photon_noise import pixel_error
 from psfdae.photometry.wings_fit import StarFluxes, add_model_errors, around_stars
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs, aperture_correction
-from psfdae.psf.wings import Wings, outer_shares
+from psfdae.psf.wings import Wings, choose_wings, outer_shares
 
 MAX_CHI2_RATIO = 2.5
 """Ratio of the median χ² of an image's bright stars to the training's, above which all stars are
@@ -190,8 +190,7 @@ def photometry(
             flux = np.append(flux, new_flux)
         if may_be_last and is_real.all() and len(place) == len(is_real):
             break
-    # Wings of the model, if this image has no star that is bright enough to show them.
-    wings_used = wings if wings is not None and wings.is_measured else model.wings
+    wings_used = choose_wings(wings, model.wings)
     # A halo that is off by δ in all pixels of a star changes its flux by δ Σ P / Σ P², which is δ
     # times the noise-equivalent area 1 / Σ P², as Σ P = 1.
     rows_columns = np.nan_to_num(fit.place[:, ::-1]).T

@@ -270,7 +270,7 @@ def around_stars(
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
     without_light = without_stars - wing_light
-    sky = subtract_sky(without_light, sky.bad, sigma_map, structure=sky.structure)
+    sky = subtract_sky(without_light, sky.bad, sigma_map, sky.least_noise, structure=sky.structure)
     del without_light
     # The map estimates the mode, below the mean for photon noise and undetected stars. Both
     # are under stars, too: the mean deviation is added to the level.
@@ -331,10 +331,15 @@ def subtract_halos(
     cores, halo_error = find_saturated_cores(is_saturated), np.zeros_like(residual)
     distance = np.hypot(*(stars.place[:, None] - cores[:, :2]).T)
     is_on_core = distance < cores[:, 2:] + 1.0
-    move_wings(is_on_core.any(axis=0), 1.0)
+    is_added = is_on_core.any(axis=0)
+    move_wings(is_added, 1.0)
     for core, is_on_this in zip(cores, is_on_core, strict=True):
+        # A star on several cores counts once: its wings are a part of the first halo, or they are
+        # subtracted again if its first core has none, since they are all that is known then.
+        is_first = is_on_this & is_added
+        is_added &= ~is_on_this
         if (halo := measure_halo(residual, bad, sigma, core)) is None:
-            move_wings(is_on_this, -1.0)  # the wings are all that is known of its light
+            move_wings(is_first, -1.0)
             continue
         wing_light[halo.window] += halo.light
         residual[halo.window] -= halo.light

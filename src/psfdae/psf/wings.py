@@ -164,9 +164,16 @@ class Wings:
 
     @property
     def is_measured(self) -> bool:
-        """True if pixels of the image made the error of the light smaller than the prior's."""
+        """True if pixels of the image made the error of the light less than half the prior's."""
         sigma = compute_prior_profile(self.radius_px, self.outer_share)[1]
-        return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
+        return self.light()[1] < 0.5 * replace(self, covariance=np.diag(sigma**2)).light()[1]
+
+
+def choose_wings(wings: Wings | None, trained_wings: Wings | None) -> Wings | None:
+    """Return the wings of an image, or of the training if no star of the image shows them."""
+    if trained_wings is None or (wings is not None and wings.is_measured):
+        return wings
+    return trained_wings
 
 
 def outer_shares(

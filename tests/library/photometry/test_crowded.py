@@ -35,9 +35,10 @@ from psfdae.photometry.wings_fit import (
     draw_wings,
     fit_wings,
     measure_halo,
+    subtract_halos,
 )
 from psfdae.psf.grid import PsfGrid
-from psfdae.psf.wings import Wings, compute_prior_profile, outer_shares
+from psfdae.psf.wings import Wings, choose_wings, compute_prior_profile, outer_shares
 from psfdae.training import neighbours
 from psfdae.training.neighbours import draw_other_stars
 from psfdae_paper.stars.example import add_stamps, write_field
@@ -220,6 +221,9 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
         # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
         assert light == pytest.approx(0.65 * 0.03, abs=0.002)
         assert 0.3 * light < error < 1.5 * light
+    # Photometry takes them in place of the wings of the training if the image shows them.
+    assert (choose_wings(wings, true) is wings) == (brightness == 1.0)
+    assert choose_wings(wings, None) is wings and choose_wings(None, true) is true
     assert fit_wings(image, *noise, stars._replace(flux=np.full(30, np.nan)), 10) is None
 
 
@@ -434,6 +438,23 @@ def test_a_halo_is_the_median_of_rings_and_goes_on_as_a_power_of_the_distance():
         ring = ratio[(radius > near) & (radius < far)]
         assert np.median(ring) == pytest.approx(1.0, abs=tolerance)
     assert (light[radius > 257] == 0).all() and (light[radius < 255] > 0).all()
+
+
+@pytest.mark.parametrize("distance", [9, 60])
+def test_wings_of_a_star_on_saturated_cores_without_halos_are_subtracted_once(distance):
+    """Nothing is left of them, and they are in the map of the light, for one core or two."""
+    place = np.array([[100.0, 100.0], [104.0, 100.0]])
+    wings = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    stars = StarFluxes(place, np.full(2, 1e3), np.full(2, 0.03))
+    light = draw_wings((200, 200), stars, wings)
+    is_saturated = np.zeros(light.shape, bool)
+    for column in (100, 100 + distance):
+        is_saturated[98:103, column - 2 : column + 3] = True
+    residual, wing_light = np.zeros_like(light), light.copy()
+    args = np.zeros(light.shape, bool), np.full(light.shape, 1e3), stars, wings, is_saturated
+    assert (subtract_halos(residual, wing_light, *args) == 0.0).all()
+    assert np.abs(residual).max() <= 1e-6 * light.max()
+    assert np.abs(wing_light - light).max() <= 1e-6 * light.max()
 
 
 @pytest.mark.parametrize(
