@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class KernelSettings(Group):
     """Settings: the side of the kernel, and what the training loop asks for."""
 
-    side_px: Annotated[int, Field(ge=3, le=15)] = 9
+    side_px: Literal[3, 5, 7, 9, 11, 13, 15] = 9
     """Side of the kernel, odd."""
     lr: Annotated[float, Field(gt=0)] = 0.02
     """Learning rate, or its maximum for one-cycle."""
@@ -94,7 +94,7 @@ class Kernel(Method):
 
         # A checkpoint of other settings or other stars is not resumed.
         decisions: dict[str, Any] = {"kernel": dump_deciding(kernel), "seed": data.seed}
-        decisions["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        decisions["noise"] = [data.levels.tolist(), str(data.noise)]
         arrays = data.images, data.references, data.fit, data.validation
         with loop.progress(kernel.epochs) as report:
             assert data.checkpoint is not None

@@ -13,5 +13,6 @@ if [ -z "$TARGETS" ]; then
 fi
 mkdir -p .snakemake
 export PYTHONWARNINGS='ignore:coroutine:RuntimeWarning'
-flock .snakemake/psfdae.lock "$@" --report "$PSFDAE_RESULTS/.report.html" -- $TARGETS
+[ -z "$(command -v flock)" ] || set -- flock .snakemake/psfdae.lock "$@"
+"$@" --report "$PSFDAE_RESULTS/.report.html" -- $TARGETS
 mv "$PSFDAE_RESULTS/.report.html" "$PSFDAE_RESULTS/report.html"

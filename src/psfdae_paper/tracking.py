@@ -370,16 +370,17 @@ def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:
     from psfdae_paper.sweeps.measurement import locate_fit
 
     # A point has a folder with all its files; one that was stopped or failed lacks some of them.
+    data: Path | None
     source = f"sweeps/{name}/points/{point}"
     folder = results / source
     result = read_json(folder / "result.json")
     kind, config = result["model"], result["config"]
     # Files of the model, and the product with its training data if the workflow made it.
     if kind in estimators.list_swept_networks():
-        place, data = folder, f"alignment/{estimators.ESTIMATORS[kind].states}"
+        place = folder
+        data = results / f"data/alignment/{estimators.ESTIMATORS[kind].states}.h5"
     else:
-        place = locate_fit(method(kind), folder)
-        data = "/".join(config.get(group, {}).get("name", "") for group in ("scene", "stars"))
+        place, data = locate_fit(method(kind), folder), find_stars(results, config)
     names = ("cost.json", "evaluation.csv", "validation.csv", HISTORY)
     fit_files = [folder / "result.json", *filter(Path.is_file, _list_fit_files(kind, place))]
     files = [*filter(Path.is_file, (folder / name for name in names))]
@@ -395,5 +396,29 @@ def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:
         name=values or point,
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
-        data=results / f"data/{data}.h5",
+        data=data,
     )
+
+
+def find_stars(results: Path, config: Mapping[str, Any]) -> Path | None:
+    """Return the stars that were simulated with the settings of a point; None without them.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of the results.
+    config : mapping
+        Settings of the point and of its stars.
+
+    Raises
+    ------
+    ProductError
+        If a file of stars is damaged.
+    """
+    # A hash ends the names of stars and their folder if a dataset changes the scene.
+    scene, stars = (config.get(group, {}).get("name", "") for group in ("scene", "stars"))
+    for path in sorted(results.glob(f"data/{scene}*/{stars}*.h5")) if scene and stars else ():
+        simulation = read_product(path, "stars", ()).config
+        if all(config.get(group) == settings for group, settings in simulation.items()):
+            return path
+    return None

@@ -253,6 +253,11 @@ def test_a_fetched_run_has_the_files_of_the_archived_one(archived, results, tmp_
     # The same run gives the same bytes.
     archive(results, tmp_path / "again.tar")
     assert (tmp_path / "again.tar").read_bytes() == archived.read_bytes()
+    # Links are archived as the files that they lead to.
+    (results / "tables/t.csv").rename(results / "elsewhere.csv")
+    (results / "tables/t.csv").symlink_to(results / "elsewhere.csv")
+    archive(results, tmp_path / "links.tar")
+    assert (tmp_path / "links.tar").read_bytes() == archived.read_bytes()
     # A run that is there stays.
     with pytest.raises(ArchiveError, match="exists; name a folder"):
         fetch(archived, tmp_path / "fetched")

@@ -175,7 +175,9 @@ def draw_method(fit_axes, star_axes, points, look):
         (fit_axes, lengths, "fit_cpu_s"),
         (star_axes, points[points["used"]], "star_ms"),
     ):
-        axes.errorbar(rows[time], rows["over_least"], yerr=rows["over_least_stderr"], **style)
+        # Tables of earlier versions have no standard errors.
+        deviation = rows.get("over_least_stderr")
+        axes.errorbar(rows[time], rows["over_least"], yerr=deviation, **style)
     marked = {"paper": points["point"] == "paper", "knee": points["knee"] == "yes"}
     marked["used"] = points["used"] & (len(points) > 1)
     for name, rows in marked.items():

@@ -548,8 +548,10 @@ class PosteriorNetworkTraining(Training):
         for _ in range(self.steps):
             stamps, position = self.stars.draw(self.settings.batch, rng)
             number = rng.integers(len(levels), size=len(stamps))
-            noisy = self.data.noise.draw_gaussian(stamps, levels[number], rng)
-            arrays = (stamps, noisy, number, position.astype(np.float32))
+            # Laws with correlated pixels need images.
+            images = stamps.reshape(-1, *self.data.images.shape[1:])
+            noisy = self.data.noise.draw_gaussian(images, levels[number], rng)
+            arrays = (stamps, noisy.reshape(stamps.shape), number, position.astype(np.float32))
             yield tuple(map(torch.from_numpy, arrays))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:

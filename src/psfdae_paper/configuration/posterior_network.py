@@ -29,7 +29,7 @@ class PosteriorNetworkSettings(Group):
     batch: Count = 512
     """Noisy stamps per step."""
     lr: Annotated[float, Field(gt=0, le=1)] = 3.0e-3
-    """Maximum of Adam's learning rate."""
+    """Maximum of the learning rate."""
     schedule: Literal["onecycle", "constant"] = "onecycle"
     """Course of the learning rate."""
     threads: Count = 1

@@ -83,6 +83,13 @@ def compare_settings(evaluations: pd.DataFrame, variants: Sequence[Variant]) -> 
     return result.sort_values([*ROW, "setting"]).reset_index(drop=True)[[*ROW, "setting", *NUMBERS]]
 
 
+def list_settings(rows: pd.DataFrame) -> list[str]:
+    """Return the settings of a table, the one that the others are divided by first."""
+    # Its ratios are 1. The first row may have another one: settings may differ in noise levels.
+    names = dict.fromkeys(rows.setting)
+    return sorted(names, key=lambda name: not (rows.ratio[rows.setting == name] == 1.0).all())
+
+
 def format_settings(table: pd.DataFrame, name: str) -> str:
     """Return the MSE of all settings side by side as Markdown.
 
@@ -94,7 +101,7 @@ def format_settings(table: pd.DataFrame, name: str) -> str:
         Name of the experiment.
     """
     rows = table[table.metric == "mse"]
-    settings = [*dict.fromkeys(rows.setting)]
+    settings = list_settings(rows)
     keys = [key for key in ROW if key != "metric"]
     lines = [
         f"Experiment {name}: MSE × 10⁶, mean and standard error over {rows.seeds.max()} seeds",
@@ -104,8 +111,8 @@ def format_settings(table: pd.DataFrame, name: str) -> str:
     ]
     for key, group in rows.groupby(keys, sort=False, observed=True):
         *names, level = map(str, key)
-        values = group.set_index("setting")
-        cells = [_format_cell(values.loc[s]) if s in values.index else "" for s in settings]
+        values = dict(group.set_index("setting").iterrows())
+        cells = [_format_cell(values[s]) if s in values else "" for s in settings]
         lines.append(f"| {' | '.join([*names, f'{float(level):g}', *cells])} |")
     return "\n".join(lines) + "\n"
 
@@ -130,7 +137,7 @@ def draw_experiment(table: pd.DataFrame, name: str) -> Figure:
         Name of the experiment.
     """
     rows = table[table.metric == "mse"]
-    settings, methods = [*dict.fromkeys(rows.setting)], [*dict.fromkeys(rows.method)]
+    settings, methods = list_settings(rows), [*dict.fromkeys(rows.method)]
     has_ratios = all(rows.ratio[rows.setting == setting].notna().any() for setting in settings)
     columns = ("ratio", "ratio_stderr") if has_ratios else ("value", "stderr")
     label = f"MSE / MSE of {settings[0]}" if has_ratios else METRIC_LABELS["mse"]

@@ -24,7 +24,7 @@ from psfdae.methods.interface import (
     Storage,
     TrainingSet,
 )
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.noise import build_noise
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class PosteriorNetworkMethod(Method):
             "settings": dump_deciding(posterior_network),
             "simulation": config.model_dump(),
             "name": cls.name,
-            "noise": [data.levels.tolist(), data.noise.kappa, data.noise.background],
+            "noise": [data.levels.tolist(), str(data.noise)],
         }
         digest = loop.fingerprint(decisions, data.images, data.validation, data.positions)
         with loop.progress(posterior_network.epochs) as report:
@@ -135,5 +135,4 @@ class PosteriorNetworkMethod(Method):
         """Return the network with the noise of the configuration."""
         from psfdae_paper.bounds.posterior_network import PosteriorNetwork
 
-        noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
-        return cls(PosteriorNetwork(arrays, noise))
+        return cls(PosteriorNetwork(arrays, build_noise(config["noise"])))

@@ -64,7 +64,11 @@ def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
         if recorded.get(name, sums[name]) != sums[name]:
             raise ProductError(f"{path}: differs from its checksum in {manifest}")
     lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items()).encode()
-    with atomic_path(out) as temporary, tarfile.open(temporary, "w") as tar:
+    with (
+        atomic_path(out) as temporary,
+        # Links, of which `fetch` accepts none, are stored as the files that they lead to.
+        tarfile.open(temporary, "w", dereference=True) as tar,
+    ):
         # The checksums come first, so that every member is verified when it is read.
         member = tarfile.TarInfo(CHECKSUMS)
         member.size, member.mode = len(lines), 0o644
@@ -157,6 +161,8 @@ def unpack(file: Path, folder: Path) -> None:
         member is a link, or lies outside the folder.
     """
     with tarfile.open(file, "r:") as tar:
+        # The filter rejects absolute paths, `..` and links once more. Python 3.11.3 lacks it.
+        tar.extraction_filter = getattr(tarfile, "data_filter", lambda member, path: member)
         first = tar.next()
         content = tar.extractfile(first) if first and first.name == CHECKSUMS else None
         if first is None or content is None or first.size > MAX_CHECKSUMS_B:
@@ -171,8 +177,7 @@ def unpack(file: Path, folder: Path) -> None:
             digest = missing.pop(member.name, None)
             if digest is None:
                 raise ArchiveError(f"{file}: {member.name}: has no checksum, or appears twice")
-            # The filter rejects absolute paths, `..` and links once more.
-            tar.extract(member, folder, filter="data")
+            tar.extract(member, folder)
             if compute_sha256(folder / member.name) != digest:
                 raise ArchiveError(f"{file}: {member.name}: damaged, differs from its checksum")
     if missing:

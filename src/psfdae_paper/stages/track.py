@@ -6,8 +6,8 @@ runs in a database or on a server, their models (`psfdae_paper.registry`), and a
 action for each run.
 
 A training shows its epochs in MLflow while it runs, if the environment asks for it by
-PSFDAE_EPOCHS=psfdae_paper.stages.track:logger (`psfdae.methods.networks.training.listener`); so
-does `make reproduce TRACK=live`.
+PSFDAE_EPOCHS=psfdae_paper.stages.track:logger (`psfdae.methods.networks.training.listener`), and
+names folder and preset by PSFDAE_RESULTS and PRESET. `make reproduce TRACK=live` sets all three.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from psfdae.base.files import read_product
 from psfdae.base.settings import parse_settings
 from psfdae.methods import method
 from psfdae.methods.interface import FitError
-from psfdae.stars.noise import NoiseModel
+from psfdae.methods.networks.training import Training
+from psfdae.stars.noise import CorrelatedNoise, GaussianNoise, NoiseModel
 from psfdae.training.star_sets import training_set
 from psfdae_paper.bounds.estimates import propagate_static_psfs
 from psfdae_paper.bounds.posterior_network import (
@@ -193,6 +195,29 @@ def test_training_lowers_the_error_and_calibrates_sigma(product, name, tmp_path)
     once, again = (kind.fit(data, short).estimate(noisy, level, data.positions) for _ in range(2))
     assert np.array_equal(once.psf, again.psf)
     assert np.array_equal(once.sigma, again.sigma)
+
+
+@pytest.mark.parametrize("law", [GaussianNoise, partial(CorrelatedNoise, shift_px=0.5)])
+def test_training_with_another_noise_law_begins_anew(product, law, tmp_path, monkeypatch):
+    kind = method("posterior_network")
+    config = load_stage(("seed", "noise", "parts", "posterior_network"), WORDS)
+    data = training_set(config, kind, product, "random", "realisation", checkpoint=tmp_path / "c")
+    changes = {"epochs": 2, "steps": 2, "checkpoint_seconds": 0.0}
+    settings, run_epoch = config.posterior_network.model_copy(update=changes), Training.run_epoch
+
+    def run_one_epoch(training):
+        if training.history:
+            raise KeyboardInterrupt
+        return run_epoch(training)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Training, "run_epoch", run_one_epoch)
+        kind.fit(data, settings)
+    # The checkpoint of the first law is not continued.
+    other = replace(data, noise=law(data.noise.kappa, data.noise.background))
+    fits = [kind.fit(replace(other, checkpoint=tmp_path / name), settings) for name in ("c", "d")]
+    first, second = (fit.to_arrays()["output"] for fit in fits)
+    assert np.array_equal(first, second) and first.any()
 
 
 def test_stars_of_an_image_and_templates_are_rejected(product, tmp_path):

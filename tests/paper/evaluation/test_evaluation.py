@@ -210,6 +210,10 @@ def test_the_table_and_the_figure_of_an_experiment_show_all_settings():
     assert bars.get_segments()[0][:, 1] == pytest.approx(3.2 + np.array([-0.1, 0.1]) / 3**0.5)
     assert (panel.get_title(), panel.get_xlabel()) == ("DAE", "noise level λ")
     assert figure.get_supylabel() == "MSE / MSE of paper"
+    # The first setting need not have the first level.
+    later = draw_experiment(table[(table.setting != "paper") | (table.noise_level > 1e-3)], "mine")
+    assert [bars.get_label() for bars in later.axes[0].containers] == ["paper", "b", "a"]
+    assert later.get_supylabel() == "MSE / MSE of paper"
     # Without a common level, the errors themselves.
     rows = table[
         (table.setting != "b") & ~((table.setting == "paper") & (table.noise_level > 1e-3))

@@ -22,6 +22,7 @@ from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measurement import Task
+from psfdae_paper.tracking import find_stars
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
@@ -239,6 +240,22 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     for direction, number in (("minimize", 3), ("maximize", 0)):
         best_point = sweep_summary.choose(results, "validation_mse", direction)
         assert best_point["point"] == f"{number:012x}"
+
+
+def test_stars_of_a_point_have_its_settings(tmp_path):
+    """Stars of another telescope have the same name, and a hash after it."""
+    trees, columns = {}, {"field_index": Column(np.arange(3), "1", "fields")}
+    for ending, obscuration in (("", 0.0), ("_0123abcd", 0.2)):
+        tree = {"scene": {"name": "seidel"}, "stars": {"name": "seidel_10pct"}}
+        tree |= {"telescope": {"obscuration": obscuration}}
+        path = tmp_path / f"data/seidel{ending}/seidel_10pct{ending}.h5"
+        path.parent.mkdir(parents=True)
+        write_product(path, "stars", columns, tree)
+        trees[path] = {**tree, "train": {"lr": 0.1}}
+    for path, tree in trees.items():
+        assert find_stars(tmp_path, tree) == path
+    assert find_stars(tmp_path, {**tree, "telescope": {"obscuration": 0.3}}) is None
+    assert find_stars(tmp_path, {"train": {"lr": 0.1}}) is None
 
 
 def test_sweep_is_a_parent_run_with_a_child_per_point(site):
