@@ -193,6 +193,9 @@ def compare_values(first: Path, second: Path, name: str) -> pd.DataFrame:
         # The same number may be written as 0 and as 0.0.
         numbers = pd.to_numeric(table[key], errors="coerce")
         table[key] = table[key].mask(numbers.notna(), numbers.map("{:.9g}".format))
+    # Rows of a table of numbers alone have equal keys.
+    if not keys:
+        keys, texts = ["row"], [table.assign(row="") for table in texts]
     # Of equal keys, the first rows belong together, then the second ones.
     rows = [t.assign(copy=t.groupby(keys).cumcount()).set_index([*keys, "copy"]) for t in texts]
     common = rows[0].index.intersection(rows[1].index)

@@ -60,6 +60,7 @@ def scan(config: Config, dataset: str, out: File) -> None:
     out : Path
         CSV with the SSIM over scale, r0 and dynamic range.
     """
+    config.noise.require_poisson("the paper's rows are")
     limit_threads(1)  # batches run in parallel
     # Columns of the paper's tables with the original noise, before any method.
     rows = [row for row in read_original_noise() if row.dataset == dataset]
@@ -218,6 +219,7 @@ def calibrate(
     # Each of the paper's columns, and simulated stars with the configured parameters.
     products = dict(stars)
     values = _read_simulated_values(products)
+    config.noise.require_poisson("the paper's rows are")
     limit_threads(config.evaluation.threads)
     scan_table = read_tables(scans)
     columns = pd.DataFrame(

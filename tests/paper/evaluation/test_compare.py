@@ -236,6 +236,13 @@ def test_a_table_without_an_entry_is_compared_by_its_texts(tmp_path):
     ]
 
 
+def test_a_table_of_numbers_alone_is_compared_by_its_rows(tmp_path):
+    for run, value in (("a", 2.0), ("b", 3.0)):
+        write_text(tmp_path / run / "tables/new.csv", f"x,y\n1,5\n{value},5\n")
+    values = record_tables.compare_values(tmp_path / "a", tmp_path / "b", "tables/new.csv")
+    assert len(values) == 4
+
+
 def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
     """Each split has stars of its own besides: easy ones there, hard ones here."""
     all_errors = errors(1, 1e-5).assign(reference="realisation")
