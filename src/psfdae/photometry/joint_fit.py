@@ -62,6 +62,7 @@ def fit_stars(
     box_px: int,
     range_px: float,
     origin: np.ndarray | None = None,
+    expected: tuple[np.ndarray, float] | None = None,
 ) -> JointFit:
     """Fit all stars of an image together.
 
@@ -83,6 +84,9 @@ def fit_stars(
         Distance that a star may move from its origin along either axis.
     origin : ndarray, shape (n, 2), optional
         Places of the stars by a list or by detection, by default where the fit starts.
+    expected : tuple of ndarray, shape (n, 2), and float, optional
+        Places that are known independently of this image, and their standard error along either
+        axis, px: the fit is the most probable one, given these. By default, pixels alone decide.
     """
     fit = _Fit(psfs, image, error, bad, place, min(box_px, psfs.side_px))
     middle = fit.start if origin is None else origin[fit.stars]
@@ -90,7 +94,10 @@ def fit_stars(
     fit.set_flux(fit.best_flux() if flux is None else np.nan_to_num(flux[fit.stars]))
     # A place is known to its range: an even chance of ± a has the variance a²/3.
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
-    damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.squares()
+    if expected is not None:
+        fit.expected, fit.pull = expected[0][fit.stars], 1.0 / expected[1] ** 2
+        prior[1:] = fit.pull
+    damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.cost()
     moving = np.ones(len(fit.stars), dtype=bool)
     # Stars without neighbours take three or four steps, close pairs ten.
     for _ in steps("joint fit", range(15)):
@@ -110,13 +117,13 @@ def fit_stars(
         fit.move(rows, step[rows])
         # Levenberg (1944, Q. Appl. Math. 2, 164): a step of a group after which it fits worse is
         # taken back, and the next one is shorter the less this one was worth what was expected.
-        squares = fit.squares()
-        gain = np.bincount(group, cost - squares)
+        new_cost = fit.cost()
+        gain = np.bincount(group, cost - new_cost)
         is_worse, is_poor = ((gain < part * expected_gain)[group] & moving for part in (-0.5, 0.1))
         back = np.flatnonzero(is_worse)
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
-        cost = fit.squares() if len(back) else squares
+        cost = fit.cost() if len(back) else new_cost
     bound = np.abs(fit.place - middle) > 0.999 * range_px
     return fit.result(len(place), prior, moving, bound)
 
@@ -192,6 +199,8 @@ class _Fit:
         self.weight = weight.ravel()[self.boxes]
         self.start = place[self.stars].astype(np.float64)
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
+        # Places that are known beforehand, and their inverse variance; 0 if none are.
+        self.expected, self.pull = self.start, 0.0
         self._light = np.empty((len(self.stars), side, side))
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         self._draw(np.arange(len(self.stars)))
@@ -252,6 +261,11 @@ class _Fit:
         residual = self.weight * self.residual.ravel()[self.boxes]
         return np.asarray(np.square(residual).sum(axis=(1, 2)))
 
+    def cost(self) -> np.ndarray:
+        """Return χ² (m,) of the boxes and of the distances from the expected places."""
+        distance_square = np.square(self.place - self.expected).sum(axis=1)
+        return np.asarray(self.squares() + self.pull * distance_square)
+
     def solve(
         self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -266,6 +280,9 @@ class _Fit:
         # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
         residual = self.weight * self.residual.ravel()[self.boxes]
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
+        # Places, if they are fitted, are drawn to where they are expected.
+        if design.shape[1] == self.parameters:
+            gradient[:, 1:] -= self.pull * (self.place - self.expected)
         if not len(unit):
             return gradient, gradient
         # It is positive definite: no pivots, and an order for symmetric matrices.

@@ -594,3 +594,24 @@ def test_of_two_stars_that_move_to_one_place_one_is_kept():
     swapped = crowded.find_duplicates(place[[0, 1, 2, 4, 3]], flux[[0, 1, 2, 4, 3]], 2, 1.0)
     assert sorted(swapped) == [2, 4]
     assert crowded.find_duplicates(place, flux, 2, 0.1).size == 0
+
+
+def test_a_list_is_as_accurate_as_where_its_bright_stars_are():
+    """Shifted by 0.4, −0.2 px, with a scatter of 0.5 px; none from few stars, or wild ones."""
+    rng, count, fwhm = np.random.default_rng(3), 400, 1.5
+    origin = 10.0 * np.stack(np.divmod(np.arange(count), 20), axis=1)
+    place = origin + rng.normal([0.4, -0.2], 0.5, origin.shape)
+    flux_error = np.where(np.arange(count) < 300, 1.0, 40.0)
+    place[300:] += 2.0  # faint stars, which noise has moved
+    fit = SimpleNamespace(
+        place=place, flux=np.full(count, 100.0), flux_error=flux_error, flags=np.zeros(count, int)
+    )
+    expected, error_px = crowded.list_places(fit, origin, fwhm)
+    assert expected - origin == pytest.approx(np.tile([0.4, -0.2], (count, 1)), abs=0.1)
+    assert error_px == pytest.approx(0.5, rel=0.15)
+    fit.place = origin.copy()
+    assert crowded.list_places(fit, origin, fwhm)[1] == pytest.approx(0.375)
+    fit.place = origin + rng.normal(0, 2.0, origin.shape)
+    assert crowded.list_places(fit, origin, fwhm) is None
+    fit.flags[9:] = 1
+    assert crowded.list_places(fit, origin, fwhm) is None

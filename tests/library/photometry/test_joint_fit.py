@@ -113,6 +113,28 @@ def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
     assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
 
 
+def test_stars_are_drawn_to_known_places_as_far_as_noise_hides_them(psfs):
+    """At S/N 3, places scatter as the list's do; at 300 as those by the pixels alone."""
+    rng, sigma = np.random.default_rng(7), 10.0
+    axis = np.arange(10.0, 115, 12)
+    place = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    place += rng.uniform(-0.5, 0.5, place.shape)
+    for snr, most, least in ((3.0, 0.25, 0.0), (300.0, 1.05, 0.95)):
+        flux = np.full(len(place), snr * sigma * np.sqrt(4 * np.pi) * SIGMA_PX)
+        image = image_of(psfs, place, flux) + rng.normal(0, sigma, (120, 120))
+        listed = place + rng.normal(0, 0.1, place.shape)
+        rest = np.full(image.shape, sigma), np.zeros(image.shape, bool), listed, None, BOX_PX
+        free, drawn = (
+            fit_stars(psfs, image, *rest, FWHM_PX, expected=known)
+            for known in (None, (listed, 0.1))
+        )
+        ratio = np.std(drawn.place - place) / np.std(free.place - place)
+        assert least <= ratio < most
+        pulls = (drawn.place - place) / drawn.place_error
+        assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
+        assert np.mean(drawn.flux / flux) == pytest.approx(1.0, abs=0.15 / snr * 3)
+
+
 def test_the_normal_matrix_has_1_on_its_diagonal_whatever_the_prior():
     rng, prior = np.random.default_rng(2), np.array([0.0, 3.0, 50.0])
     design, boxes = rng.normal(size=(2, 3, 4, 4)), np.arange(32).reshape(2, 4, 4)
