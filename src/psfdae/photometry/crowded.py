@@ -238,9 +238,9 @@ def list_places(fit: JointFit, origin: np.ndarray, fwhm: float) -> tuple[np.ndar
     offset = (fit.place - origin)[is_bright]
     if len(offset) < 10:
         return None
-    # Lists are less accurate for faint stars: at least the error that an image of the same depth has
-    # at S/N 2.4, where √2 · FWHM/2.355 divided by S/N is a quarter of the FWHM. With a tenth, fluxes
-    # of faint stars of noisy lists would be 13 % too small.
+    # Lists are less accurate for faint stars: at least the error that an image of the same depth
+    # has at S/N 2.4, where √2 · FWHM/2.355 divided by S/N is a quarter of the FWHM. With a tenth,
+    # fluxes of faint stars of noisy lists would be 13 % too small.
     error_px = max(0.25 * fwhm, float(robust_scatter(offset).max()))
     if error_px > fwhm / np.sqrt(3.0):
         return None
