@@ -50,10 +50,11 @@ def words(program):
 
 
 def test_page_from_the_telescope_s_file_to_restored_stars(workshop):
-    steps = words("psfdae")
-    assert set(TINY) == {step[0] for step in steps}
-    for step in steps:
-        printed(*step, *TINY[step[0]])
+    # Stages of the reproduction are commands of `psfdae paper`.
+    steps = [(line[line[0] == "paper"], line) for line in words("psfdae")]
+    assert set(TINY) == {name for name, _ in steps}
+    for name, line in steps:
+        printed(*line, *TINY[name])
     examples = [f"example_{kind}" for kind in ("seidel", "newtonian", "ritchey_chretien")]
     figures = [f"{folder}/psfs.png" for folder in (*examples, "mine", "hazy")]
     for name in (*figures, "mine/psfs.fits", "night/map.png"):
