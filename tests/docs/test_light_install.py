@@ -144,7 +144,6 @@ def test_help_lists_what_works_here_and_names_the_extra_for_the_others(light, tm
     lines = run(light, tmp_path, "psfdae --help")
     for heading in (
         "Your images:",
-        "Models:",
         "Telescopes:",
         'with the extra "paper": pip install',
     ):
