@@ -236,7 +236,7 @@ class Denoiser(ABC):
         data, hidden = stars.data, stars.bad & ~stars.saturated
         if hidden.any():
             data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
-        shift = displacement(data, self.bundle.info.jitter_px, self._centring_px)
+        shift = displacement(data, self.bundle.info.jitter_px, self._centring_px, hidden)
         shift[has_exact_centre] = 0
         # A star cannot be moved farther than the pixels around its stamp reach.
         is_too_far = np.abs(shift).max(axis=1) > margin

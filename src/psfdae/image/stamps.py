@@ -222,7 +222,9 @@ def blur_stamps(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
     return np.asarray(ndimage.gaussian_filter(stamps, (0.0, sigma, sigma), mode="nearest"))
 
 
-def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -> np.ndarray:
+def displacement(
+    stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0, bad: np.ndarray | None = None
+) -> np.ndarray:
     """Return the displacement of each star from the range of centring errors of the training.
 
     The training moves stars by up to `jitter_px` whole pixels, so only a star outside this range is
@@ -237,6 +239,8 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
         Maximum centring error of the training, in pixels along each axis.
     centring_px : float
         FWHM of the Gaussian with which the training smooths stars to find their brightest pixels.
+    bad : ndarray of bool, shape (n, s, s), optional
+        Pixels that were filled, which show no noise.
 
     Returns
     -------
@@ -260,7 +264,8 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
     # The peak must exceed the middle by 5 σ of the difference of two smoothed pixels, which is
     # √2 · 6/16 = 0.53 of the σ of a pixel.
     excess = smooth[star].max(axis=(1, 2)) - smooth[star, centre, centre].max(axis=(1, 2))
-    significant = excess > 5.0 * 0.53 * border_scatter(stamps[star])
+    noise = border_scatter(stamps[star], None if bad is None else bad[star])
+    significant = excess > 5.0 * 0.53 * noise
     offset[star[significant]] = brightest[star[significant]]
     return offset
 

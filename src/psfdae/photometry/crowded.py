@@ -155,16 +155,16 @@ def photometry(
     # Positions of all stars that were found in residuals: each is tried once.
     peaks = np.empty((0, 2))
     # Places by the list, and their error, as soon as its bright stars have shown it.
-    is_listed, expected = observation.detections is None, None
+    is_listed, place_prior = observation.detections is None, None
     for turn in steps("photometry", range(turns)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
         fit = fit_stars(
-            psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin, expected
+            psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin, place_prior
         )
         del without_wings, wing_light  # of a large image, each map takes much memory
         place, flux = np.where(np.isfinite(fit.place), fit.place, place), fit.flux
-        expected = list_places(fit, origin, fwhm) if is_listed else None
+        place_prior = list_places(fit, origin, fwhm) if is_listed else None
         # Sky and light beyond the stamps, from the image without the light of stars.
         earlier_level = sky.level
         fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
@@ -178,7 +178,7 @@ def photometry(
         # Two fits at least; one more with halos, since the first fluxes contain their light, and
         # with the list of a crowd, if the sky of the first fit contained light of stars.
         is_changed = halo_error.any() or (
-            expected is not None
+            place_prior is not None
             and area_px * abs(np.mean(sky.level - earlier_level))
             > 0.2 * np.nanmedian(fit.flux_error)
         )
@@ -193,8 +193,8 @@ def photometry(
         # stars and find none.
         if not is_listed and turn < turns - 2:
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
-            known = np.concatenate([place, peaks])
-            new, new_flux = find_stars(psfs, sky.signal, sigma, known, threshold, fwhm)
+            known_places = np.concatenate([place, peaks])
+            new, new_flux = find_stars(psfs, sky.signal, sigma, known_places, threshold, fwhm)
             place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
             flux = np.append(flux, new_flux)
         if may_be_last and is_real.all() and len(place) == len(is_real):
@@ -239,8 +239,8 @@ def list_places(fit: JointFit, origin: np.ndarray, fwhm: float) -> tuple[np.ndar
     if len(offset) < 10:
         return None
     # Lists are less accurate for faint stars: at least the error that an image of the same depth
-    # has at S/N 2.4, where √2 · FWHM/2.355 divided by S/N is a quarter of the FWHM. With a tenth,
-    # fluxes of faint stars of noisy lists would be 13 % too small.
+    # has at S/N 2.4, where √2 · FWHM/2.355 divided by S/N is a quarter of the FWHM. A smaller
+    # one would make fluxes of faint stars of noisy lists too small.
     error_px = max(0.25 * fwhm, float(robust_scatter(offset).max()))
     if error_px > fwhm / np.sqrt(3.0):
         return None

@@ -62,7 +62,7 @@ def fit_stars(
     box_px: int,
     range_px: float,
     origin: np.ndarray | None = None,
-    expected: tuple[np.ndarray, float] | None = None,
+    place_prior: tuple[np.ndarray, float] | None = None,
 ) -> JointFit:
     """Fit all stars of an image together.
 
@@ -84,7 +84,7 @@ def fit_stars(
         Distance that a star may move from its origin along either axis.
     origin : ndarray, shape (n, 2), optional
         Places of the stars by a list or by detection, by default where the fit starts.
-    expected : tuple of ndarray, shape (n, 2), and float, optional
+    place_prior : tuple of ndarray, shape (n, 2), and float, optional
         Places that are known independently of this image, and their standard error along either
         axis, px: the fit is the most probable one, given these. By default, pixels alone decide.
     """
@@ -94,8 +94,8 @@ def fit_stars(
     fit.set_flux(fit.best_flux() if flux is None else np.nan_to_num(flux[fit.stars]))
     # A place is known to its range: an even chance of ± a has the variance a²/3.
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
-    if expected is not None:
-        fit.expected, fit.pull = expected[0][fit.stars], 1.0 / expected[1] ** 2
+    if place_prior is not None:
+        fit.prior_place, fit.pull = place_prior[0][fit.stars], 1.0 / place_prior[1] ** 2
         prior[1:] = fit.pull
     damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.cost()
     moving = np.ones(len(fit.stars), dtype=bool)
@@ -200,7 +200,7 @@ class _Fit:
         self.start = place[self.stars].astype(np.float64)
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
         # Places that are known beforehand, and their inverse variance; 0 if none are.
-        self.expected, self.pull = self.start, 0.0
+        self.prior_place, self.pull = self.start, 0.0
         self._light = np.empty((len(self.stars), side, side))
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         self._draw(np.arange(len(self.stars)))
@@ -263,7 +263,7 @@ class _Fit:
 
     def cost(self) -> np.ndarray:
         """Return χ² (m,) of the boxes and of the distances from the expected places."""
-        distance_square = np.square(self.place - self.expected).sum(axis=1)
+        distance_square = np.square(self.place - self.prior_place).sum(axis=1)
         return np.asarray(self.squares() + self.pull * distance_square)
 
     def solve(
@@ -282,7 +282,7 @@ class _Fit:
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
         # Places, if they are fitted, are drawn to where they are expected.
         if design.shape[1] == self.parameters:
-            gradient[:, 1:] -= self.pull * (self.place - self.expected)
+            gradient[:, 1:] -= self.pull * (self.place - self.prior_place)
         if not len(unit):
             return gradient, gradient
         # It is positive definite: no pivots, and an order for symmetric matrices.

@@ -43,7 +43,7 @@ def cost_tables(run: Run) -> list[str]:
         for dataset in points.datasets
         for name in [*method_names(run, dataset), *points.further_methods]
         if name in points.further_methods or method(name).look.restores
-        for path in _cost_tables_of(run, dataset, name)
+        for path in _list_cost_tables(run, dataset, name)
     ]
 
 
@@ -54,11 +54,11 @@ def network_cost_tables(run: Run) -> list[str]:
         path
         for dataset in points.datasets
         for name in points.networks
-        for path in _cost_tables_of(run, dataset, name)
+        for path in _list_cost_tables(run, dataset, name)
     ]
 
 
-def _cost_tables_of(run: Run, dataset: str, name: str) -> list[str]:
+def _list_cost_tables(run: Run, dataset: str, name: str) -> list[str]:
     """Return the tables of a method of a dataset, one for each of its settings."""
     points = load_timing_points().overrides(dataset, name)
     return [f"{run.results}/costs/{dataset}/{name}-{point}.csv" for point in points]

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from prediction_stars import observe
 from psfdae.denoise import flux_model as module
+from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.flux_model import FluxModel, robust_flux
 from psfdae.denoise.leading_modes import LeadingModes, compute_clipped_rms
 from psfdae.denoise.star_flux import Photometer
@@ -261,6 +262,30 @@ def test_root_mean_square_of_scores_is_without_outliers_and_without_nan():
 def test_noise_moves_no_star(field_psfs):
     stars = observe(field_psfs, 1e-2, seed=4)
     assert displacement(stars.stamps, 1).any(axis=1).mean() < 0.01
+
+
+def test_filled_pixels_do_not_count_as_noise(shipped):
+    """They would make its estimate small: noise would move stars, and skies would seem wrong."""
+    rng, size = np.random.default_rng(6), (200, shipped.stamp_px, shipped.stamp_px)
+    stamps, bad = rng.normal(100.0, 1.0, size), np.zeros(size, bool)
+    border = np.unravel_index(border_pixels(size[-1]), size[1:])
+    bad[:, border[0][::2], border[1][::2]] = bad[:, border[0][1::4], border[1][1::4]] = True
+    filled = np.where(bad, 100.0, stamps)
+    assert displacement(filled, 1).any(axis=1).mean() > 0.1
+    assert not displacement(filled, 1, bad=bad).any()
+    # The given sky is right; another one, 20 σ away, is not.
+    for sky, is_off in ((100.0, False), (120.0, True)):
+        flags = shipped.predict(stamps, background=np.full(200, sky), bad=bad).flags
+        assert ((flags & StarFlag.SKY_OFF > 0) == is_off).all()
+
+
+def test_intervals_of_95_percent_contain_those_of_68_percent():
+    noise, unit = np.array([0.01, 0.1]), np.ones((2, 8, 8))
+    errors = replace(ErrorModel.build_uncalibrated(noise, unit), ratio95=np.array([0.5, 2.0]))
+    given = SimpleNamespace(noise=np.ones(3), flux=np.ones(3), background=np.zeros(3))
+    psf = np.full((3, 8, 8), 1 / 64)
+    _, ratio95, _ = errors.half_width(psf, None, np.array([0.01, 0.07, 0.1]), given)
+    assert ratio95[:, 0] == pytest.approx([1.0, 1.5, 2.0])
 
 
 def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():

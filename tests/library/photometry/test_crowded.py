@@ -24,6 +24,7 @@ from psfdae.denoise.bundle import BundleError
 from psfdae.image.camera import CameraValue
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
+from psfdae.image.sky import subtract_sky
 from psfdae.image.stamps import cut_image
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
@@ -31,6 +32,7 @@ from psfdae.photometry.image_photometry import add_unmeasured_rows
 from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
 from psfdae.photometry.wings_fit import (
     StarFluxes,
+    around_stars,
     draw_tents,
     draw_wings,
     fit_wings,
@@ -438,6 +440,16 @@ def test_a_halo_is_the_median_of_rings_and_goes_on_as_a_power_of_the_distance():
         ring = ratio[(radius > near) & (radius < far)]
         assert np.median(ring) == pytest.approx(1.0, abs=tolerance)
     assert (light[radius > 257] == 0).all() and (light[radius < 255] > 0).all()
+
+
+def test_read_noise_limits_the_noise_of_the_sky_in_all_fits():
+    """Without light, an image of whole counts has no noise of its own."""
+    image, none = np.full((128, 128), 50.0), np.zeros((128, 128), bool)
+    sky = subtract_sky(image, none, least_noise=3.0)
+    stars = StarFluxes(np.array([[64.0, 64.0]]), np.array([1e3]), np.array([0.03]))
+    nothing = np.zeros(image.shape)
+    again = around_stars(image, sky, sky.noise, nothing, stars, 16, None, 1.0, none)[0]
+    assert sky.noise.min() == again.noise.min() == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("distance", [9, 60])

@@ -125,7 +125,7 @@ def test_stars_are_drawn_to_known_places_as_far_as_noise_hides_them(psfs):
         listed = place + rng.normal(0, 0.1, place.shape)
         rest = np.full(image.shape, sigma), np.zeros(image.shape, bool), listed, None, BOX_PX
         free, drawn = (
-            fit_stars(psfs, image, *rest, FWHM_PX, expected=known)
+            fit_stars(psfs, image, *rest, FWHM_PX, place_prior=known)
             for known in (None, (listed, 0.1))
         )
         ratio = np.std(drawn.place - place) / np.std(free.place - place)
