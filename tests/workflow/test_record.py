@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -280,6 +281,20 @@ def test_a_truncated_archive_leaves_nothing(archived, tmp_path, share):
     with pytest.raises(ArchiveError, match=r"run\.tar: "):
         fetch(archived, tmp_path / "fetched")
     assert {*tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
+def test_an_error_of_the_machine_is_no_damage_of_the_archive(
+    archived, tmp_path, monkeypatch, number
+):
+    def fail(*args, **kwargs):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(tarfile.TarFile, "extract", fail)
+    with pytest.raises(ArchiveError, match=os.strerror(number)) as caught:
+        fetch(archived, tmp_path / "fetched")
+    assert "cannot be unpacked" in str(caught.value) and "damaged" not in str(caught.value)
+    assert not [*tmp_path.glob("*fetch*")]
 
 
 def hostile_member(name, kind=tarfile.REGTYPE, target=""):

@@ -96,6 +96,9 @@ def test_differences_from_the_paper_are_named(words, data, training):
     for expected, texts in ((data, differences["data"]), (training, differences["training"])):
         assert bool(texts) == bool(expected)
         assert all(any(text.startswith(start) for text in texts) for start in expected)
+    # Values are as in YAML, and no word stands for a key that the paper lacks.
+    all_texts = "\n".join(text for texts in differences.values() for text in texts)
+    assert not re.search(r"\bNone\b|instead of none|True|False", all_texts)
     line = report.describe_differences(run, "dataset3")
     assert ("ot the paper's data" in line) == bool(data)
     assert ("ot the paper's training" in line) == bool(training)

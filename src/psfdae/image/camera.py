@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -251,10 +252,7 @@ def check_camera(
         )
         warn(remarks[-1:])
     if sky.correlation > 1.0:
-        remarks.append(
-            f"{image.path}: pixels share their noise: the noise of their sums is "
-            f"{sky.correlation:.2f} times as large as of independent pixels, and errors include it"
-        )
+        remarks.append(describe_shared_noise(image.path, sky.correlation))
     # A gain of the header that cannot be right is not used; a given one is.
     problem = check_gain(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
@@ -273,6 +271,17 @@ def check_camera(
     if limit is not None and origin != "given" and sky.highest <= 1.0 < limit:
         values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
     return values, remarks, sky.correlation
+
+
+def describe_shared_noise(path: Path, correlation: float) -> str:
+    """Return a sentence on noise that pixels of an image share, such as resampled ones.
+
+    `correlation` is the ratio of the noise of their sums to the noise of sums of independent ones.
+    """
+    return (
+        f"{path}: pixels share their noise: the noise of their sums is {correlation:.2f} times as "
+        "large as of independent pixels, and errors include it"
+    )
 
 
 def check_saturation(

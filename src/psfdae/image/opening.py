@@ -21,6 +21,7 @@ from psfdae.image.camera import (
     CameraValue,
     camera_values,
     check_camera,
+    describe_shared_noise,
     refuse_colours,
     sky_coordinate_remarks,
     unread_card_remarks,
@@ -104,9 +105,7 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Imag
         # A position in a stamp is not a position on the sky.
         fields["data"] = replace(data, wcs=None)
         return add_stars(source, StampCube(**fields, margin=margin))
-    # The scale of a noise map includes the correlation of noise.
-    correlation = noise_correlation if noise_map is None else 1.0
-    image = Image(**fields, margin=margin, noise_map=noise_map, noise_correlation=correlation)
+    image = Image(**fields, margin=margin, noise_map=noise_map, noise_correlation=noise_correlation)
     # The map is scaled to the scatter of the sky, in which stars are detected.
     if source.detection_sigma is not None or noise_map is not None:
         image = search_sky(source, image)
@@ -137,7 +136,10 @@ def search_sky(source: ImageInput, image: Image) -> Image:
     with task("image", 2) as advance:
         sky = image.sky()
         advance(1, "sky")
-        sky_notes = (f"{source.path}: {note}" for note in sky.notes)
+        sky_notes = [f"{source.path}: {note}" for note in sky.notes]
+        # The sample of the sky by which the camera was checked may have shown shared noise already.
+        if sky.correlation > 1.0 and image.noise_correlation == 1.0:
+            sky_notes.append(describe_shared_noise(source.path, sky.correlation))
         image = replace(image, remarks=(*image.remarks, *sky_notes))
         if image.noise_map is not None:
             image = scale_noise_map(image, image.noise_map, sky)
@@ -163,9 +165,10 @@ def scale_noise_map(image: Image, noise_map: NoiseMap, sky: Sky) -> Image:
             camera = camera | {"gain": CameraValue(gain, label)}
             words = f"{label} grows with the light of the stars: gain {gain:.4g}"
             remarks = (*remarks, f"{image.data.path}: {words}")
-    # With this map, the sky is measured anew when it is needed; bad pixels stay.
-    cache = PixelCache(image.bad_pixels)
-    return replace(image, noise_map=noise_map, camera=camera, remarks=remarks, cache=cache)
+    # With this map, whose scale includes noise that pixels share, the sky is measured anew when it
+    # is needed; bad pixels stay.
+    image = replace(image, noise_map=noise_map, noise_correlation=1.0, camera=camera)
+    return replace(image, remarks=remarks, cache=PixelCache(image.bad_pixels))
 
 
 def image_or_cube(

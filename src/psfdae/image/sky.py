@@ -43,8 +43,10 @@ class Sky:
         Lower limit of `noise`, in the unit of the image.
     structure : SkyStructure
         Lines at which the level of the sky changes, and step of the pixels in counts.
+    correlation : float
+        Factor by which `noise` is larger than σ of single pixels, because pixels share noise.
     notes : tuple of str
-        Sentences on unusual properties of the sky.
+        Sentences on steps and structure of the sky.
     """
 
     signal: np.ndarray
@@ -54,6 +56,7 @@ class Sky:
     noise_scale: float
     least_noise: float = 0.0
     structure: SkyStructure = field(default_factory=SkyStructure)
+    correlation: float = 1.0
     notes: tuple[str, ...] = ()
 
     @cached_property
@@ -102,7 +105,7 @@ def subtract_sky(
     # Level and noise from the good pixels.
     image = np.where(bad, 0.0, image)
     sky = sky_level(image, bad, structure) if known_sky is None else known_sky
-    level, noise, structure, notes = sky
+    level, noise, *_ = sky
     # Whole counts or simulated images may show no noise. Thresholds are multiples of the noise, and
     # must not be 0: the limit is about the rounding of a double, and above 0.
     least_noise = max(least_noise, 1e-13 * float(np.ptp(image)), float(np.finfo(np.float32).tiny))
@@ -114,7 +117,7 @@ def subtract_sky(
         # Bad pixels, for which the map may lack σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
     signal = fill_bad((image - level).astype(np.float32), bad)[0]
-    return Sky(signal, level, noise, bad, scale, least_noise, structure, notes)
+    return Sky(signal, level, noise, bad, scale, least_noise, *sky[2:])
 
 
 @dataclass(frozen=True)

@@ -47,14 +47,19 @@ class SkyLevel(NamedTuple):
     ----------
     level, noise : ndarray, shape (h, w), float32
         Level and σ of the sky at each pixel.
+        `noise` is larger than σ of single pixels by `correlation`.
     structure : SkyStructure
+        Steps and fine structure.
+    correlation : float
+        Ratio of the noise of sums of pixels to the noise of sums of independent ones, at least 1.
     notes : tuple of str
-        Sentences on unusual properties of the sky.
+        Sentences on steps and structure.
     """
 
     level: np.ndarray
     noise: np.ndarray
     structure: SkyStructure
+    correlation: float
     notes: tuple[str, ...]
 
 
@@ -100,14 +105,8 @@ def sky_level(
     # Errors refer to sums of pixels, whose noise is larger if neighbours are correlated.
     with np.errstate(all="ignore"):
         correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
-    if correlation > 1.0:
-        noise *= correlation
-        notes.append(
-            "pixels share their noise, as neighbours of resampled images do, or rows or columns "
-            f"with offsets: the noise of sums of pixels is {correlation:.2f} times as large, and "
-            "errors are of sums"
-        )
-    return SkyLevel(level, noise, structure._replace(is_fine=share > 0), tuple(notes))
+    noise *= correlation
+    return SkyLevel(level, noise, structure._replace(is_fine=share > 0), correlation, tuple(notes))
 
 
 def level_and_noise(

@@ -82,9 +82,13 @@ def has_common_stars(planes: np.ndarray, stamp_px: int) -> bool:
     """
     from scipy import ndimage
 
+    # Pixels without a value get the median of their plane: they are no light, whatever the sky is.
+    is_finite = np.isfinite(planes)
+    median = np.ma.median(np.ma.array(planes, mask=~is_finite), axis=(1, 2)).filled(0.0)
+    filled_planes = np.where(is_finite, planes, median[:, None, None])
     # Means of 3 × 3 pixels above the sky, and their noise. Over the planes, their median, and what
     # nine of ten planes exceed: a star that a few planes lack, such as by a bad pixel, is common.
-    smooth = ndimage.uniform_filter(np.nan_to_num(planes), (0, 3, 3))
+    smooth = ndimage.uniform_filter(filled_planes, (0, 3, 3))
     smooth -= np.median(smooth, axis=(1, 2), keepdims=True)
     noise = np.median(robust_scatter(smooth.reshape(len(planes), -1).T))
     light, common = np.median(smooth, axis=0), np.percentile(smooth, 10, axis=0, method="lower")

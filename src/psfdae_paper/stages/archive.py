@@ -7,6 +7,7 @@ first one, SHA256SUMS, has the checksums of all others.
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tarfile
 from collections.abc import Iterator
@@ -29,6 +30,11 @@ RUN_FILES = ("run.yaml", "runtime.csv", "report.html")
 """Files of a run that its checksums leave out: settings, costs and report."""
 MAX_CHECKSUMS_B = 2**26
 """Largest size of the list of checksums, in bytes; some 500,000 files."""
+MACHINE_ERRORS = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM),
+    *(errno.ENOENT, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM),
+}
+"""Numbers of errors of disk, permissions and limits, for which no archive is to blame."""
 
 
 class ArchiveError(Error, RuntimeError):
@@ -139,9 +145,9 @@ def explain_damage(file: Path) -> Iterator[None]:
     try:
         yield
     except (tarfile.TarError, EOFError, UnicodeDecodeError, OSError) as error:
-        raise ArchiveError(f"{file}: truncated, damaged or not an archive of a run: {error}") from (
-            None
-        )
+        is_sound = isinstance(error, OSError) and error.errno in MACHINE_ERRORS
+        cause = "cannot be unpacked" if is_sound else "truncated, damaged or no archive of a run"
+        raise ArchiveError(f"{file}: {cause}: {error}") from None
 
 
 def unpack(file: Path, folder: Path) -> None:

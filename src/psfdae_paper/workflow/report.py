@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol
 
 from psfdae.base.reading import read_table, read_yaml
-from psfdae.base.settings import leaves
+from psfdae.base.settings import as_literal, leaves
 from psfdae.methods import method
 from psfdae_paper.configuration.compose import drop_neutral_settings
 from psfdae_paper.configuration.estimators import ESTIMATORS
@@ -78,8 +78,10 @@ def find_differences(run: Run, dataset: str) -> Differences:
     for key, value in own.items():
         group = key.partition(".")[0]
         if group in groups - {"workflow", "dataset"} and value != paper.get(key):
-            kind = "data" if group in DATA else "training"
-            texts[kind].append(f"{key} = {value} instead of {paper.get(key, 'none')}")
+            # Values as a user writes them, such as null.
+            text = f"{key} = {as_literal(value)}"
+            text += f" instead of {as_literal(paper[key])}" if key in paper else ", not in paper"
+            texts["data" if group in DATA else "training"].append(text)
     # Single numbers before long lists.
     return {kind: sorted(differences, key=len) for kind, differences in texts.items()}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -244,6 +246,23 @@ def test_errors_of_predictions_include_noise_that_pixels_share(model, image, kin
         off = found.x_fit - place[:, 0]
         assert np.mean(np.abs(off - np.median(off)) < found.x_error) > 0.62
     assert 0.62 < np.mean(np.abs(pulls) < 1) < 0.74
+
+
+@pytest.mark.parametrize("kind", SHARED)
+@pytest.mark.parametrize("map_kind", [None, "error", "weight"])
+@pytest.mark.parametrize("is_detected", [True, False])
+def test_a_property_of_an_image_is_said_once(image, kind, map_kind, is_detected):
+    """Sentences of the camera, the sky and the layers do not repeat each other."""
+    axis, rng = np.arange(16.0, len(image) - 16, 20), np.random.default_rng(3)
+    place = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    light = drawn(moffat(2.8), place, np.full(len(place), 2e4), 300)
+    pixels = SKY + light + 14 * SHARED[kind](rng.normal(size=image.shape), rng)
+    options = {} if map_kind is None else {map_kind: np.ones(image.shape)}
+    options |= {"detect": True} if is_detected else {"catalogue": place, "origin": 0}
+    observation = open_observation(ImageInput(pixels, **options, **SCALE), 16)
+    kinds = [re.sub(r"[-+\d.,]+", "#", remark)[:60] for remark in observation.remarks]
+    assert len(set(kinds)) == len(kinds)
+    assert sum("pixels share their noise" in k for k in kinds) == (kind != "none")
 
 
 def test_faint_sources_are_not_noise_that_pixels_share():

@@ -14,6 +14,7 @@ from psfdae.image.errors import ObservationError
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict
+from psfdae.image.stamp_cube import has_common_stars
 from small_field import GAIN, READ, drawn, moffat, noisy, ring
 
 CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
@@ -194,6 +195,20 @@ def test_stamps_of_stars_are_no_time_series(kind):
         flux = np.exp(rng.uniform(10.5, 12.5, len(place)))
         cube.append(noisy(drawn(profile, place, flux, 64), rng))
     open_observation(ImageInput(np.array(cube), **CAMERA), 16, 8).check_planes()
+
+
+@pytest.mark.parametrize("sky", [-3000.0, 0.0, 3000.0])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_pixels_without_a_value_are_no_common_star(sky, value):
+    """Also where the sky was subtracted and more: 0 would be far above it."""
+    rng = np.random.default_rng(5)
+    middle = [np.full((1, 2), 32.0)] * 12
+    stamps = np.array([noisy(drawn(moffat(2.8), xy, [5e4], 64), rng) for xy in middle]) + sky
+    stamps[:, 8:11, 50:53] = value
+    stamps[0] = value
+    assert not has_common_stars(stamps, 16)
+    stamps[1:] += drawn(moffat(2.8), np.array([[12.0, 40.0]]), [5e4], 64)
+    assert has_common_stars(stamps, 16)
 
 
 # Colours.
