@@ -147,8 +147,8 @@ def install_line(extra: str) -> str:
         note = json.loads(distribution("psfdae").read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
         note = {}
-    place = urlsplit(note.get("url", ""))
-    if place.scheme == "file" and (path := Path(unquote(place.path))).exists():
+    url = urlsplit(note.get("url", ""))
+    if url.scheme == "file" and (path := Path(unquote(url.path))).exists():
         return f'pip install "{path}[{extra}]"'
     return f'pip install ".[{extra}]" in the folder of psfdae\'s source'
 

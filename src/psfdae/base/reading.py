@@ -45,9 +45,9 @@ def parse_yaml(path: Path) -> Any:
         return yaml.load(_text(path), UniqueKeyLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        place = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        location = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = " ".join(f"{error.context or ''} {error.problem or ''}".split())
-        raise ProductError(f"{path}{place}: {problem or 'no YAML'}") from None
+        raise ProductError(f"{path}{location}: {problem or 'no YAML'}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # a character or a date that is invalid
@@ -86,9 +86,9 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError as error:
         # Position of the wrong byte, counted from line 1, column 1.
         lines = data[: error.start].decode("utf-8").split("\n")
-        place = f"line {len(lines)}, column {len(lines[-1]) + 1}"
+        location = f"line {len(lines)}, column {len(lines[-1]) + 1}"
         byte = f"{data[error.start]:#04x}"
-        raise ProductError(f"{path}: {place}: byte {byte} is not UTF-8") from None
+        raise ProductError(f"{path}: {location}: byte {byte} is not UTF-8") from None
 
 
 def from_tree(

@@ -1,4 +1,4 @@
-"""Command `psf`: write the PSFs of a field model at places of its image, for other programs."""
+"""Command `psf`: write the PSFs of a field model at positions of its image, for other programs."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def psf(
     *,
     out: File,
 ) -> None:
-    """Write the PSFs of MODEL at places of the image.
+    """Write the PSFs of MODEL at positions of the image.
 
     MODEL is of train --method field, a .psf of PSFEx, or a grid of STDPSF or STPSF.
 
     Each image of the cube is a PSF of flux 1 with its centre in the middle, sampled at parts of
-    a pixel. The header names the places, y before x, as the files of STScI's STPSF do; photutils
+    a pixel. The header names the positions, y before x, as the files of STScI's STPSF do; photutils
     3.1 reads one, or a grid. A grid in NAME.stdpsf.fits is as STScI's STDPSF, which older releases
     read, too. NAME.psf has the whole field, for SExtractor and other readers of PSFEx's models.
 
@@ -40,9 +40,9 @@ def psf(
     model : Path
         Model that knows the PSF over the field.
     at : sequence of str
-        X,Y of a place, 0-based pixels; again for more.
+        X,Y of a position, 0-based pixels; again for more.
     grid : str, optional
-        COLUMNSxROWS of places over the field of the training.
+        COLUMNSxROWS of positions over the field of the training.
     oversampling : int, optional
         Values per pixel and axis. [default: 4, of NAME.psf 8]
     overwrite : bool
@@ -65,9 +65,7 @@ def psf(
     if for_psfex:
         # The polynomial of PSFEx's format does not hold the model exactly: print the error.
         error = exchange.write_psfex(out, field_model, oversampling)
-        print(
-            f"{out}: within {error:.1g} of the brightest value of {model} at the places looked at"
-        )
+        print(f"{out}: within {error:.1g} of the brightest value of {model}, where compared")
         return
     # The given positions, or the nodes of a grid over the positions of the training stars.
     grid_shape = None if grid is None else _grid_shape(grid)
@@ -75,7 +73,7 @@ def psf(
         positions = np.array([_position(text) for text in at])
     else:
         positions = field_model.grid(*grid_shape)
-    # What the user should know of these places, then the file.
+    # What the user should know of these positions, then the file.
     for note in _notes(field_model, positions):
         print(f"{model}: {note}")
     reader = "photutils, as STDPSF"
@@ -133,7 +131,7 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
                 f"{x:g},{y:g} is off the image of {columns} columns and {rows} rows that the "
                 f"model {model.name!r} was trained on"
             )
-    # Places beyond the training stars have the PSF of the edge, which is an extrapolation.
+    # Positions beyond the training stars have the PSF of the edge, which is an extrapolation.
     try:
         low, high = model.field_range()
     except PredictionError:  # stars without positions have one PSF, which holds everywhere
@@ -141,11 +139,11 @@ def _notes(model: FieldPsfs, positions: np.ndarray) -> list[str]:
     outside_count = int(((positions < low) | (positions > high)).any(axis=1).sum())
     if outside_count:
         notes.append(
-            f"{outside_count} of {len(positions)} places are beyond the training stars, "
+            f"{outside_count} of {len(positions)} positions are beyond the training stars, "
             f"x {low[0]:.6g} … {high[0]:.6g}, y {low[1]:.6g} … {high[1]:.6g}; the PSF there is "
             "the PSF at their edge"
         )
-    # A PSF that does not change over the field makes many places useless.
+    # A PSF that does not change over the field makes many positions useless.
     if order == 0 and len(positions) > 1:
         notes.append(
             "the PSF is the same everywhere (order 0: more is not supported by stars left "

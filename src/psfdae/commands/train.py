@@ -420,12 +420,12 @@ def fit_methods(
     all_fits: dict[str, Method] = {}
     for method_class in methods:
         print(f"fitting the {method_class.look.title}")
-        place = files.fit(method_class)
+        path = files.fit(method_class)
         # A network keeps its state here while it trains, for the case that it is killed.
-        checkpoint = fits.path_beside(method_class, place, "checkpoint.pt")
+        checkpoint = fits.path_beside(method_class, path, "checkpoint.pt")
         fit = fit_method(stars, method_class, checkpoint)
         # The checkpoint goes when the fit is stored; until then, a killed run goes on from it.
-        fits.store(fit, place, describe_settings(stars, method_class), stars.product)
+        fits.store(fit, path, describe_settings(stars, method_class), stars.product)
         checkpoint.unlink(missing_ok=True)
         all_fits[method_class.name] = fit
     return all_fits

@@ -209,7 +209,7 @@ def find_constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     return np.asarray(scipy.ndimage.maximum_filter(corner, side, origin=-1))
 
 
-def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.3) -> None:
+def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, fraction_max: float = 0.3) -> None:
     """Raise an error if more than a part of the good pixels have the minimum value.
 
     Pixels that lie together, as in the even sky of an image without noise, are allowed, and so are
@@ -221,7 +221,7 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.
         Image, in any unit.
     bad : ndarray of bool, shape (h, w)
         Pixels to ignore.
-    share_max : float
+    fraction_max : float
         Fraction of the good pixels from which the sky is taken for clipped.
 
     Raises
@@ -230,28 +230,28 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, share_max: float = 0.
         If the sky is clipped at its minimum value.
     """
     # Fraction of the good pixels that has the minimum value.
-    good = ~bad
-    count = np.count_nonzero(good)
+    is_good = ~bad
+    count = np.count_nonzero(is_good)
     if not count:
         return
-    least_value = float(image.min(where=good, initial=np.inf))
+    least_value = float(image.min(where=is_good, initial=np.inf))
     at_least = image == least_value
-    share = float(np.count_nonzero(at_least & good) / count)
-    if share < share_max:
+    fraction = float(np.count_nonzero(at_least & is_good) / count)
+    if fraction < fraction_max:
         return
     # Independent neighbours differ, one at the minimum and one above, with probability 2p(1 − p).
     pairs = ~(bad[:, 1:] | bad[:, :-1])
     changes = np.count_nonzero((at_least[:, 1:] != at_least[:, :-1]) & pairs)
-    by_noise = 2.0 * share * (1.0 - share) * np.count_nonzero(pairs)
-    higher = good & ~at_least
+    by_noise = 2.0 * fraction * (1.0 - fraction) * np.count_nonzero(pairs)
+    higher = is_good & ~at_least
     if changes < 0.5 * by_noise or not higher.any():
         return
     # Fraction of the pixels that has the second value.
     second = image.min(where=higher, initial=np.inf)
-    if np.count_nonzero((image == second) & higher) / count > 0.3 * share:
+    if np.count_nonzero((image == second) & higher) / count > 0.3 * fraction:
         return
     raise ClippedSkyError(
-        f"{100 * share:.0f} % of the pixels have the least value, {least_value:g}: the sky was "
+        f"{100 * fraction:.0f} % of the pixels have the least value, {least_value:g}: the sky was "
         "clipped there, or has hardly any photons, and neither it nor its noise can be "
         "measured; take the image from before it was clipped, or write negative values, too"
     )

@@ -1,7 +1,7 @@
-"""Camera of an image: its pixel scale, gain, read noise and saturation, each with its origin.
+"""Camera of an image: its pixel scale, gain, read noise and saturation, each with its provenance.
 
-Inputs: a header and the values that the user gives. Output: each value with its origin, after a
-comparison with the pixels; values of the header that cannot be right are left out.
+Inputs: a header and the values that the user gives. Output: each value with its provenance,
+after a comparison with the pixels; values of the header that cannot be right are left out.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ HEADER_UNITS = dict(zip(HEADER_KEYS, ("arcsec", "electron/adu", "electron", "adu
 
 
 class CameraValue(NamedTuple):
-    """Number and its origin: "given", "WCS" or a key of the header.
+    """Number and its provenance: "given", "WCS" or a key of the header.
 
-    The number is None where it is not known; then the origin gives the reason.
+    The number is None where it is not known; then this gives the reason.
     """
 
     value: float | None
-    origin: str
+    provenance: str
 
 
 ONE_COLOUR = (
@@ -62,7 +62,7 @@ ONE_COLOUR = (
 
 
 def camera_values(image: ImageFile, options: Mapping[str, float | None]) -> dict[str, CameraValue]:
-    """Return pixel scale, gain, read noise and saturation, each with its origin.
+    """Return pixel scale, gain, read noise and saturation, each with its provenance.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def find_number(image: ImageFile, name: str) -> CameraValue:
     Returns
     -------
     CameraValue
-        Number with the key as origin; None if it is not in any header.
+        Number with the key as provenance; None if it is not in any header.
     """
     # Its own header overrides the file's; a truth value is not a number.
     for key in HEADER_KEYS[name]:
@@ -164,7 +164,7 @@ def find_gain(image: ImageFile) -> CameraValue:
     if is_not_counts or powers not in ({}, {"adu": 1.0}):
         return CameraValue(None, f"not known, the image is in {image.unit}")
     gain = find_number(image, "gain")
-    if gain.origin == "GAIN":
+    if gain.provenance == "GAIN":
         # A whole number from 20 on without a unit is a setting, as of amateurs' cameras.
         header = next(h for h in image.headers if card_value(h, "GAIN") is not None)
         value, comment = header["GAIN"], str(card_value(header.comments, "GAIN"))
@@ -257,19 +257,19 @@ def check_camera(
     problem = check_gain(image, sky, camera["gain"], camera["read noise"])
     if problem is None:
         return values, remarks, sky.correlation
-    origin = camera["gain"].origin
-    if origin == "given":
+    provenance = camera["gain"].provenance
+    if provenance == "given":
         return values, [*remarks, f"{image.path}: {problem}: used as stated"], sky.correlation
-    values["gain"] = CameraValue(None, f"not known, {origin} does not fit the pixels")
+    values["gain"] = CameraValue(None, f"not known, {provenance} does not fit the pixels")
     remarks.append(
         f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
         "subtracted?): not used, errors come from the pixels; "
         f"{keyword('gain')} states another one"
     )
     # On a scale on which the gain does not apply, the saturation of the camera does not, either.
-    limit, origin = values["saturation"]
-    if limit is not None and origin != "given" and sky.highest <= 1.0 < limit:
-        values["saturation"] = CameraValue(None, f"not known, {origin} is of counts")
+    limit, provenance = values["saturation"]
+    if limit is not None and provenance != "given" and sky.highest <= 1.0 < limit:
+        values["saturation"] = CameraValue(None, f"not known, {provenance} is of counts")
     return values, remarks, sky.correlation
 
 
@@ -305,19 +305,21 @@ def check_saturation(
     ObservationError
         If a given saturation is below the sky.
     """
-    unit, (limit, origin) = image.unit or "counts", saturation
+    unit, (limit, provenance) = image.unit or "counts", saturation
     remarks = []
     # A pixel of the sky cannot be saturated.
     if limit is not None and limit <= sky.level:
-        problem = f"saturation at {limit:g} {unit} ({origin}) is below the sky of {sky.level:.4g}"
-        if origin == "given":
+        problem = (
+            f"saturation at {limit:g} {unit} ({provenance}) is below the sky of {sky.level:.4g}"
+        )
+        if provenance == "given":
             problem += f"; {keyword('saturate')} takes the saturation of a pixel"
             raise ObservationError(image.path, problem)
-        saturation = CameraValue(None, f"not known, {origin} is below the sky")
+        saturation = CameraValue(None, f"not known, {provenance} is below the sky")
         advice = f"not used, {keyword('saturate')} states another one"
         remarks.append(f"{image.path}: {problem}: {advice}")
     # A pile-up of the largest value below the level of the header shows a lower saturation.
-    pile_up = None if origin == "given" else find_clipped_level(image, sky)
+    pile_up = None if provenance == "given" else find_clipped_level(image, sky)
     if pile_up is not None and (saturation.value is None or pile_up[0] < saturation.value):
         saturation = CameraValue(pile_up[0], "the largest value")
         remarks.append(
@@ -350,17 +352,17 @@ def check_gain(
     electronics = read_noise.value / gain.value if read_noise.value else 0.0
     # The larger of the two alone is a lower limit of the noise.
     least_sigma = max(photons, electronics)
-    cause = f"{gain.origin} = {gain.value:g}"
+    cause = f"{gain.provenance} = {gain.value:g}"
     # A mean of two frames has 0.71 of the noise of one; resampling leaves about 0.8.
     if sky.noise < 0.75 * least_sigma:
         if electronics >= photons:
-            cause = f"{read_noise.origin} = {read_noise.value:g} and {cause}"
+            cause = f"{read_noise.provenance} = {read_noise.value:g} and {cause}"
         return (
             f"{cause} mean a noise of the sky of at least {least_sigma:.3g} "
             f"{image.unit or 'counts'}, but the pixels scatter by {sky.noise:.3g}"
         )
     # A gain of counts on pixels of another unit, such as an image scaled to 0 … 1.
-    if sky.highest <= 1.0 and gain.origin not in ("given", "BUNIT"):
+    if sky.highest <= 1.0 and gain.provenance not in ("given", "BUNIT"):
         return f"{cause} is of counts, but no pixel is above 1"
     return None
 

@@ -35,7 +35,7 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
     if not row.size:
         return result, remaining
     reach = 2
-    wide_image, good = np.pad(result, reach), np.pad(~bad, reach)
+    wide_image, is_good = np.pad(result, reach), np.pad(~bad, reach)
     # Gaussian mean of the good pixels around, Σ w v / Σ w.
     steps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
@@ -43,16 +43,16 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
     for down in steps:
         for across in steps:
             at = row + reach + down, column + reach + across
-            weight = weights[down + reach, across + reach] * good[at]
+            weight = weights[down + reach, across + reach] * is_good[at]
             # Sums over the pixels that are down and across by these steps.
             mean += weight * wide_image[at]
             weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
     for axis in (np.array([1, 0]), np.array([0, 1])):
         pixels = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
-        values, is_good = [wide_image[at] for at in pixels], [good[at] for at in pixels]
-        has_line = is_good[1] & is_good[2]
-        has_cubic = has_line & is_good[0] & is_good[3]
+        values, can_use = [wide_image[at] for at in pixels], [is_good[at] for at in pixels]
+        has_line = can_use[1] & can_use[2]
+        has_cubic = has_line & can_use[0] & can_use[3]
         line = 0.5 * (values[1] + values[2])
         # Cubic through −2, −1, 1, 2 at 0: (4 (v₋₁ + v₁) − v₋₂ − v₂) / 6; line: (v₋₁ + v₁) / 2.
         cubic = (4.0 * (values[1] + values[2]) - values[0] - values[3]) / 6.0

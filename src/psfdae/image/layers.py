@@ -320,11 +320,11 @@ def measure_photons(noise_map: NoiseMap, sky: Sky) -> float:
     sigma = noise_map.read_sigma()
     # Pixels of stars in which photons of the star are a large part of the variance, if any are;
     # and pixels of the sky.
-    good = ~sky.bad & np.isfinite(sigma)
+    is_good = ~sky.bad & np.isfinite(sigma)
     variance, snr = sigma**2, sky.signal / np.where(sky.noise > 0, sky.noise, np.inf)
-    bright = good & (sky.signal > 0)
+    bright = is_good & (sky.signal > 0)
     bright &= snr >= np.quantile(snr[bright], 0.9) if bright.any() else False
-    faint = good & (np.abs(snr) < 1.0)
+    faint = is_good & (np.abs(snr) < 1.0)
     if np.count_nonzero(bright) < 50 or not faint.any():
         return 0.0
     # Slope of the variance with the light, and its scatter: 1.48 median deviations.

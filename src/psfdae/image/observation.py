@@ -160,13 +160,13 @@ class Observation(ABC):
     @property
     def scale_assumed(self) -> bool:
         """True if neither header nor user gives the pixel scale."""
-        return self.camera["pixel scale"].origin == "assumed"
+        return self.camera["pixel scale"].provenance == "assumed"
 
     def assume_scale(self) -> Self:
         """Return the observation with `assumed_scale_arcsec` if the scale is unknown."""
         if self.pixel_scale_arcsec is not None:
             return self
-        # The origin shows that the scale is an assumption.
+        # The provenance shows that the scale is an assumption.
         scale = CameraValue(self.assumed_scale_arcsec, "assumed")
         return replace(self, camera=self.camera | {"pixel scale": scale})
 
@@ -214,12 +214,12 @@ class Observation(ABC):
         return {"ra": coordinates.ra.deg, "dec": coordinates.dec.deg}
 
     def summary(self) -> str:
-        """Return lines: camera values with their origins, remarks, pixels and rows left out."""
-        # The camera: number and unit with their origin, or why the number is not known.
+        """Return lines: camera values with their provenance, remarks, pixels and rows left out."""
+        # The camera: number and unit with their provenance, or why the number is not known.
         units = ("arcsec", "electrons per count", "electrons", "counts")
         words = [
-            f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}"
-            for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True)
+            f"{name} {source if value is None else f'{value:.6g} {unit} ({source})'}"
+            for (name, (value, source)), unit in zip(self.camera.items(), units, strict=True)
         ]
         lines = [f"{self.path}: {', '.join(words)}", *self.remarks]
         # Pixels of the image that are bad, and rows of the list without a position.

@@ -41,7 +41,7 @@ from psfdae.image.sky import Sky
 from psfdae.image.stamp_cube import StampCube
 from psfdae.image.stamps import StarFlag, raise_flag
 
-Opened = TypeVar("Opened", Image, StampCube)
+ImageOrCube = TypeVar("ImageOrCube", Image, StampCube)
 
 
 def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Image | StampCube:
@@ -262,7 +262,7 @@ def detect_stars(image: Image, sky: Sky, threshold: float) -> Catalogue:
     return Catalogue(image.path, table)
 
 
-def add_stars(source: ImageInput, image: Opened) -> Opened:
+def add_stars(source: ImageInput, image: ImageOrCube) -> ImageOrCube:
     """Return an image or cube with the stars of its list, or of a cube without one.
 
     Parameters

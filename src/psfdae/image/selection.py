@@ -304,19 +304,19 @@ def measure_stamps(
         "verdict": verdict,
     }
     # Only good stars keep their stamps; centres are measured later, for fewer stars.
-    good = verdict == Verdict.GOOD
+    is_good = verdict == Verdict.GOOD
     return columns, BrightStars(
-        stamps=light[good],
-        peak=peak[good],
-        centre=np.full((good.sum(), 2), np.nan),
-        position=position[good],
-        flux=flux[good],
-        noise=noise[good],
-        snr=snr[good],
-        row=np.flatnonzero(good),
-        listed=stamps.listed[good],
-        colour=stamps.colour[good],
-        bad=bad[good],
+        stamps=light[is_good],
+        peak=peak[is_good],
+        centre=np.full((is_good.sum(), 2), np.nan),
+        position=position[is_good],
+        flux=flux[is_good],
+        noise=noise[is_good],
+        snr=snr[is_good],
+        row=np.flatnonzero(is_good),
+        listed=stamps.listed[is_good],
+        colour=stamps.colour[is_good],
+        bad=bad[is_good],
     )
 
 
@@ -353,7 +353,7 @@ def fill_bad_pixels(
     stars : BrightStars
         The stars, with new pixels, peaks, centres, fluxes and S/N where they have bad pixels.
     missing : ndarray, shape (n,)
-        Part of the light in the stamp that is in bad pixels.
+        Fraction of the light in the stamp that is in bad pixels.
     """
     from scipy.spatial import cKDTree
 
@@ -379,9 +379,11 @@ def fill_bad_pixels(
             psf = np.median(aligned_stamps[neighbours[neighbours != star]], axis=0)
             psf = shift_stamps(psf[None], stars.centre[star][None])[0]
             bad = stars.bad[star]
-            good = ~bad[stamp]
-            square = float(np.square(psf[stamp][good]).sum())
-            flux = float((images[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
+            is_good = ~bad[stamp]
+            square = float(np.square(psf[stamp][is_good]).sum())
+            flux = (
+                float((images[star][stamp] * psf[stamp])[is_good].sum()) / square if square else 0.0
+            )
             images[star][bad] = flux * psf[bad]
             missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
         # Measure these stars again; a star without light keeps its measurements.

@@ -225,9 +225,9 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
     # All stamps at once, then those with bad pixels one by one.
     median = np.median(flat[:, ring], axis=1).astype(np.float64)
     for star in np.flatnonzero(is_bad.any(axis=1)):
-        good = flat[star, ring][~is_bad[star, ring]]
-        good = good if good.size else flat[star][~is_bad[star]]
-        median[star] = np.median(good) if good.size else 0.0
+        good_pixels = flat[star, ring][~is_bad[star, ring]]
+        good_pixels = good_pixels if good_pixels.size else flat[star][~is_bad[star]]
+        median[star] = np.median(good_pixels) if good_pixels.size else 0.0
     return median
 
 

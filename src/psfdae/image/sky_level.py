@@ -95,10 +95,10 @@ def sky_level(
         if lines:
             lines_text = ", ".join(map(str, lines))
             notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
-    level, noise, share = level_and_noise(image, bad, structure, mesh_px)
-    if share:
+    level, noise, fraction = level_and_noise(image, bad, structure, mesh_px)
+    if fraction:
         notes.append(
-            f"the sky has structure within {mesh_px} px in {100 * share:.0f} % of the image: "
+            f"the sky has structure within {mesh_px} px in {100 * fraction:.0f} % of the image: "
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
     noise = remove_dither(noise, dither_variance)
@@ -106,7 +106,9 @@ def sky_level(
     with np.errstate(all="ignore"):
         correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
     noise *= correlation
-    return SkyLevel(level, noise, structure._replace(is_fine=share > 0), correlation, tuple(notes))
+    return SkyLevel(
+        level, noise, structure._replace(is_fine=fraction > 0), correlation, tuple(notes)
+    )
 
 
 def level_and_noise(
@@ -135,8 +137,8 @@ def level_and_noise(
     ratio = noise[sample] / pixel_sigma[sample]
     ratio = ratio[~bad[sample] & (ratio > 0)]
     typical_ratio = max(float(np.percentile(ratio, 25)), 1e-6) if ratio.size else 1.0
-    share = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
-    if not (is_fine or share > 0.05):
+    fraction = float(np.mean(ratio > 1.5 * typical_ratio)) if ratio.size else 0.0
+    if not (is_fine or fraction > 0.05):
         return level, noise, 0.0
     fine_level = median_level(image - level, bad)
     if not (is_fine or keeps_peaks(image - level, fine_level, bad, pixel_sigma)):
@@ -147,7 +149,7 @@ def level_and_noise(
     remainder, noise = _measure_sky(image - level, bad, mesh_px)
     level += remainder
     noise += weight * (_measure_sky(image - level, bad, 16)[1] - noise)
-    return level, noise, share
+    return level, noise, fraction
 
 
 # Noise of pixels and of sums of pixels.
@@ -224,9 +226,9 @@ def noise_correlation(deviation: np.ndarray) -> float:
         return float(np.sqrt(1.0 + 4.0 * offsets)) if offsets > 0.05 else 1.0
     # √(1 + 2 Σ ρ a): each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
-    noise_shares = np.array([_correlation(values, *lag) for lag in lags])
-    source_shares = correlate_sources(deviation[middle], lags, noise_shares)
-    excess = float((noise_shares - structure) @ source_shares)
+    noise_correlations = np.array([_correlation(values, *lag) for lag in lags])
+    source_correlations = correlate_sources(deviation[middle], lags, noise_correlations)
+    excess = float((noise_correlations - structure) @ source_correlations)
     excess /= max(1.0 - structure, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 
@@ -481,12 +483,12 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24)
         Width in px of the strips on both sides of a line that are compared.
     """
     # Along all of the line and its halves, each with at most 512 columns of it.
-    values, good = (image, ~bad) if axis == 0 else (image.T, ~bad.T)
+    values, is_good = (image, ~bad) if axis == 0 else (image.T, ~bad.T)
     count = values.shape[1]
     lines: list[int] = []
     for part in (slice(0, count), slice(0, count // 2), slice(count // 2, count)):
         every = max(1, (part.stop - part.start) // 256)
-        lines += _steps_across(values[:, part][:, ::every], good[:, part][:, ::every], reach_px)
+        lines += _steps_across(values[:, part][:, ::every], is_good[:, part][:, ::every], reach_px)
     # Lines that several parts found are one.
     steps: list[int] = []
     for line in sorted(lines):
@@ -495,7 +497,7 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24)
     return steps
 
 
-def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[int]:
+def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> list[int]:
     """Return the rows of some columns (h, n) at which the level has a step.
 
     A step is the same in most eighths of the columns, up to 3 px from the row and from 3 to 12 and
@@ -506,7 +508,7 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     ----------
     values : ndarray, shape (h, n)
         Pixels of the image, or of every few columns.
-    good : ndarray of bool, shape (h, n)
+    is_good : ndarray of bool, shape (h, n)
         Pixels that are used.
     reach_px : int
         Rows on either side of a step that must show it, 24.
@@ -515,7 +517,9 @@ def _steps_across(values: np.ndarray, good: np.ndarray, reach_px: int) -> list[i
     if height < 4 * reach_px or count < 64:
         return []
     # Sums of the good pixels and their numbers up to each row: their differences give means.
-    sums = (np.cumsum(v, axis=0, dtype=np.float64) for v in (np.where(good, values, 0.0), good))
+    sums = (
+        np.cumsum(v, axis=0, dtype=np.float64) for v in (np.where(is_good, values, 0.0), is_good)
+    )
     light, number = (np.pad(v, ((1, 0), (0, 0))) for v in sums)
     lines = np.arange(2 * reach_px, height - 2 * reach_px + 1)
     side = reach_px // 2

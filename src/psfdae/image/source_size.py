@@ -145,10 +145,10 @@ def measure_windows(
     rings = np.empty((len(windows), len(area)))
     offset = np.empty(len(windows))
     stars = zip(windows, is_measured, centre, strict=True)
-    for star, (window, good, (row, column)) in enumerate(stars):
+    for star, (window, is_used, (row, column)) in enumerate(stars):
         # Distance of each pixel from the centre of the star.
         radius = np.hypot(axis[:, None] - row, axis - column)
-        rings[star] = ring_light(window[good], radius[good], edges)
+        rings[star] = ring_light(window[is_used], radius[is_used], edges)
         # A neighbour farther out may be brighter than the star.
         core = np.where(radius < max(4.0, reach_px / 6), window, -np.inf)
         peak = np.unravel_index(core.argmax(), core.shape)

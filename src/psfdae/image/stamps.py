@@ -106,7 +106,7 @@ class StarFlag(IntFlag):
     OFF_CENTRE = (
         256,
         "brightest pixel farther from the centre than the stamp could be moved; in "
-        "photometry, the fit moved the star by half a FWHM and three errors of its place",
+        "photometry, the fit moved the star by half a FWHM and three errors of its position",
     )
     UNLIKE_TRAINING = (
         512,

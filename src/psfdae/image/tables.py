@@ -25,8 +25,8 @@ PIXEL_UNIT = "unit of the image"
 COLUMNS: dict[str, tuple[str, str, str]] = {
     "image": ("", "", "file of the exposure"),
     "id": ("", "", "by the star list, else the number of the star"),
-    "x": ("pix", ".4f", "place in the image, 0-based, columns"),
-    "y": ("pix", ".4f", "place in the image, 0-based, rows"),
+    "x": ("pix", ".4f", "position in the image, 0-based, columns"),
+    "y": ("pix", ".4f", "position in the image, 0-based, rows"),
     "ra": ("deg", ".8f", "ICRS, of the fitted centre if there is one"),
     "dec": ("deg", ".8f", "ICRS, of the fitted centre if there is one"),
     "verdict": ("", "", "good, or why the star is not used for training"),

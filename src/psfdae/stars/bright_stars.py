@@ -22,7 +22,7 @@ def magnitude(flux: np.ndarray) -> np.ndarray:
     return np.asarray(-2.5 * np.log10(np.maximum(flux, 1e-300)))
 
 
-def places(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) -> np.ndarray:
+def psf_coordinates(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Return the coordinates on which the PSF may depend: x, y, magnitude and colour, (n, 4)."""
     # Coordinates of one star in a row.
     return np.column_stack([position, magnitude(flux), colour])
@@ -110,12 +110,12 @@ class BrightStars:
         return BrightStars(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @property
-    def place(self) -> np.ndarray:
+    def coordinates(self) -> np.ndarray:
         """x, y, magnitude and colour, (n, 4); an unknown colour is the median of the others."""
         # The median of the known colours takes the place of an unknown one.
         has_colour = np.isfinite(self.colour)
         median = np.median(self.colour[has_colour]) if has_colour.any() else np.nan
-        return places(self.position, self.flux, np.where(has_colour, self.colour, median))
+        return psf_coordinates(self.position, self.flux, np.where(has_colour, self.colour, median))
 
     def area(self) -> np.ndarray:
         """Return the noise-equivalent area A = (F / (σ S/N))² of each star in pixels, (n,)."""

@@ -206,7 +206,7 @@ def build_optic(
 
     # Elements of batoid: a plane at a height, an aperture that blocks light outside of a radius,
     # and surfaces. All are centred on the axis.
-    def place_at(z: float) -> Any:
+    def frame_at(z: float) -> Any:
         return batoid.CoordSys().shiftLocal([0.0, 0.0, z])
 
     def clear(radius: float) -> Any:
@@ -218,8 +218,8 @@ def build_optic(
             surface = batoid.Paraboloid(settings.radius_m)
         else:
             surface = batoid.Quadric(settings.radius_m, settings.conic)
-        place = place_at(settings.vertex_m)
-        return batoid.Mirror(surface, name=name, coordSys=place, obscuration=aperture)
+        frame = frame_at(settings.vertex_m)
+        return batoid.Mirror(surface, name=name, coordSys=frame, obscuration=aperture)
 
     def lens(name: str, settings: Lens) -> Any:
         # Two spheres, from the vacuum into the glass and out of it.
@@ -229,7 +229,7 @@ def build_optic(
             batoid.RefractiveInterface(
                 batoid.Sphere(radius),
                 name=f"{name} {side}",
-                coordSys=place_at(vertex),
+                coordSys=frame_at(vertex),
                 obscuration=clear(settings.clear_radius_m),
                 inMedium=in_medium,
                 outMedium=out_medium,
@@ -258,10 +258,10 @@ def build_optic(
         items.append(mirror(prescription.secondary, "M2", aperture))
     items += [lens(*item) for item in prescription.ordered_lenses]
     # Detector and entrance pupil, planes across the axis.
-    detector = place_at(prescription.best_focus_m + light_direction * defocus_m)
+    detector = frame_at(prescription.best_focus_m + light_direction * defocus_m)
     items.append(batoid.Detector(batoid.Plane(), name="D", coordSys=detector, obscuration=None))
     entrance_pupil = batoid.Interface(
-        batoid.Plane(), name="entrance pupil", coordSys=place_at(prescription.entrance_pupil_m)
+        batoid.Plane(), name="entrance pupil", coordSys=frame_at(prescription.entrance_pupil_m)
     )
     return batoid.CompoundOptic(
         items,

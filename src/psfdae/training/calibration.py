@@ -414,7 +414,7 @@ def fit_outlier_limits(model: StarModel, stars: ModelStars) -> ErrorModel:
     images, is_measured = bright.cut_frames(model.info.stamp_px)
     images = np.where(is_measured, images, 0.0) / bright.flux[:, None, None]
     noise = bright.noise / bright.flux
-    prediction = model.predict(images, noise=noise, background=0.0, position=bright.place)
+    prediction = model.predict(images, noise=noise, background=0.0, position=bright.coordinates)
     # All but 1 % of them, which may be unlike the others, and a margin for other pixels.
     score, distance = (
         1.1 * float(np.quantile(values[np.isfinite(values)], 0.99))

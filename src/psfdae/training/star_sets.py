@@ -17,7 +17,7 @@ from psfdae.base.rng import stream
 from psfdae.base.settings import Config, OfFit, WithNoise
 from psfdae.methods.fit_files import get_training_reference
 from psfdae.methods.interface import Method, TrainingSet
-from psfdae.stars.bright_stars import BrightStars, places
+from psfdae.stars.bright_stars import BrightStars, psf_coordinates
 from psfdae.stars.noise import NoiseModel, OwnNoise, build_noise, noise_equivalent_px
 from psfdae.stars.splits import Split, held_out_split, random_split
 
@@ -46,7 +46,7 @@ def field_positions(stars: Product) -> np.ndarray:
     # Rows of fields, or of bright stars; each has several images.
     position = stars["grid"]
     if are_real(stars):
-        position = places(stars["position"], stars["flux"], stars["colour"])
+        position = psf_coordinates(stars["position"], stars["flux"], stars["colour"])
     return np.asarray(position[stars["field_index"]])
 
 

@@ -653,7 +653,7 @@ def test_a_change_between_exposures_is_a_fraction_of_the_coefficient(stars, fiel
     monkeypatch.setattr("psfdae.methods.field.fit.solve_splines", solve)
     prior = field.model
     fitter = replace(FieldFitter.build(stars, 1e6, FRAME, SIDE), prior=prior)
-    terms, settings = prior.terms(stars.place), fitter.settings
+    terms, settings = prior.terms(stars.coordinates), fitter.settings
     options = FitOptions(knots=prior.coefficients.shape[1], smoothness=0.0, order=2, change=0.1)
     weight = np.full(fitter.images.shape, 1e6)
     coefficients = fitter.fit_splines(

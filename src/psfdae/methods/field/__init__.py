@@ -347,7 +347,7 @@ def compute_arrays(
     """
     # Mean star and variation over the field, from the stars that are not outliers.
     used_stars = bright.select(fit.good)
-    terms = fit.model.terms(used_stars.place)
+    terms = fit.model.terms(used_stars.coordinates)
     mean_terms = terms.mean(axis=0)
     # Nodes are closer together where the mean star is narrow.
     mean_star = fit.model.images(mean_terms[None], np.zeros((1, 2)), side)

@@ -235,7 +235,7 @@ class FieldFitter:
         gain.
         """
         # Range of each coordinate over the stars; (0, 0) for one that no star has.
-        finite_columns = [column[np.isfinite(column)] for column in stars.place.T]
+        finite_columns = [column[np.isfinite(column)] for column in stars.coordinates.T]
         ends = [
             (column.min(), column.max()) if column.size else (0.0, 0.0) for column in finite_columns
         ]
@@ -249,7 +249,7 @@ class FieldFitter:
             is_valid=is_valid,
             noise=stars.noise,
             photons=np.sqrt(background) / stars.noise,  # σ = √B / g
-            place=stars.place,
+            place=stars.coordinates,
             axis=np.arange(frame_px) - frame_px // 2.0,
             stamp_px=stamp_px,
             around_px=max(stars.stamps[0].size - stamp_px**2, 1),
