@@ -34,36 +34,3 @@ else:
     CCDData = NDData = Column = QTable = Table = Quantity = UnitBase = WCS = Any
     Dataset = File = Axes = LineCollection = Figure = DataFrame = GriddedPSFModel = Any
     csc_array = ThreadpoolController = CompoundOptic = Module = Tensor = Any
-
-__all__ = [
-    "WCS",
-    "Artist",
-    "Axes",
-    "AxesImage",
-    "BaseCoordinateFrame",
-    "BinTableHDU",
-    "CCDData",
-    "Column",
-    "CompoundOptic",
-    "DataFrame",
-    "Dataset",
-    "Figure",
-    "FigureBase",
-    "File",
-    "GriddedPSFModel",
-    "HDUList",
-    "Header",
-    "ImageHDU",
-    "LineCollection",
-    "Module",
-    "NDData",
-    "PrimaryHDU",
-    "QTable",
-    "Quantity",
-    "SkyCoord",
-    "Table",
-    "Tensor",
-    "ThreadpoolController",
-    "UnitBase",
-    "csc_array",
-]

@@ -14,7 +14,7 @@ import os
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
@@ -26,7 +26,6 @@ from typing import (
     Annotated,
     Any,
     Literal,
-    Protocol,
     TypeVar,
     Union,
     get_args,
@@ -46,11 +45,8 @@ from psfdae.commands.terminal import bar_or_lines
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class Reader(Protocol):
-    """Function that makes the settings which a command's parameter `config` receives."""
-
-    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
-        """Return settings from the other options, a file, or words of the command line."""
+Reader = Callable[[Mapping[str, Any], Path | None, Sequence[str]], Any]
+"""Makes what a parameter `config` receives of the other options, a file, and overrides."""
 
 
 @dataclass(frozen=True)
@@ -210,21 +206,17 @@ class SettingsCommand(click.Command):
                     formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; `--quiet` is not a parameter of its function."""
-        with use_command_words():
-            return self.invoke_displayed(ctx)
+        """Run the command with its progress and summary, or without them if it is quiet.
 
-    def invoke_displayed(self, ctx: click.Context) -> Any:
-        """Run the command with its progress and summary, or without them if it is quiet."""
-        if not ctx.params.pop("quiet"):
-            with use_display(bar_or_lines):
-                return super().invoke(ctx)
-        # Errors are written to the other stream.
-        with (
-            use_display(None),
-            Path(os.devnull).open("w", encoding="utf-8") as null,
-            redirect_stdout(null),
-        ):
+        `--quiet` is not a parameter of its function.
+        """
+        is_quiet = ctx.params.pop("quiet")
+        with ExitStack() as stack:
+            stack.enter_context(use_command_words())
+            stack.enter_context(use_display(None if is_quiet else bar_or_lines))
+            if is_quiet:  # errors are written to the other stream
+                null = stack.enter_context(Path(os.devnull).open("w", encoding="utf-8"))
+                stack.enter_context(redirect_stdout(null))
             return super().invoke(ctx)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -290,18 +282,13 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
         Words by their heading, without headings of none.
     """
     # Headings of all packages, in their order; packages may share a heading.
-    headings: dict[str, list[str]] = {}
-    required: dict[str, str] = {}
-    for package in map(import_module, _packages()):
-        for heading, commands in getattr(package, "SECTIONS", {}).items():
-            headings.setdefault(heading, []).extend(commands)
-        required |= getattr(package, "REQUIRED", {})
     available: dict[str, list[str]] = {}
-    for heading, commands in headings.items():
-        for word in commands:
-            module = required.get(word)
-            if word in words and (not module or find_spec(module) is not None):
-                available.setdefault(heading, []).append(word)
+    for package in map(import_module, _packages()):
+        required = getattr(package, "REQUIRED", {})
+        for heading, commands in getattr(package, "SECTIONS", {}).items():
+            for word in commands:
+                if word in words and (word not in required or find_spec(required[word])):
+                    available.setdefault(heading, []).append(word)
     return available
 
 

@@ -1,4 +1,4 @@
-"""Command `photometry`: fluxes of all stars of an image with the PSF of its field."""
+"""Commands `photometry` and `residual`: stars of an image, measured with the PSF of its field."""
 
 from __future__ import annotations
 
@@ -73,3 +73,34 @@ def photometry_command(
     print(f"{out}: {len(photometry.table)} stars, {count} measured", *photometry.notes, sep="\n")
     if "mag" not in photometry.table.colnames:
         print("no magnitudes: --zero-point, or --reference with a list of some, gives them")
+
+
+@command("residual")
+def residual_command(
+    image: Annotated[File, {"argument": True}],
+    options: ImageOptions,
+    overwrite: bool = False,
+    *,
+    model: File,
+    out: File,
+) -> None:
+    """Subtract the sky and all stars of IMAGE, which are measured as by photometry.
+
+    Parameters
+    ----------
+    image : Path
+        FITS image.
+    options : ImageOptions
+        Options of the image, and its star list.
+    overwrite : bool
+        Replace a file that exists.
+    model : Path
+        Model of train --method field, .psf of PSFEx, or grid of STDPSF or STPSF.
+    out : Path
+        FITS image.
+    """
+    source = ImageInput(image, **vars(options))
+    check_targets((*source.files(), model), out, overwrite=overwrite)
+    photometry = measure_all_stars(load_field(model), source)
+    write_fits(out, photometry.residual.to_hdu()[0])
+    print(f"{out}: {len(photometry.table)} stars subtracted", *photometry.notes, sep="\n")

@@ -86,21 +86,14 @@ def predict_command(
     out : Path
         FITS file for PSFs, residuals, uncertainties and a table of stars.
     """
+    arguments = dict(locals())
     if all_extensions:
         # Images are worked on side by side, each by one thread, with its own model and outputs.
-        job = dict(locals())
-        jobs = {
-            name: {
-                **job,
-                "options": image_options,
-                "all_extensions": False,
-                "model": find_bundle(model, name),
-                "plot": name_image_path(plot, name),
-                "threads": 1,
-                "out": name_image_path(out, name),
-            }
-            for name, image_options in options_by_image(stars, options).items()
-        }
+        jobs = {}
+        for name, image_options in options_by_image(stars, options).items():
+            changes = {"options": image_options, "all_extensions": False, "threads": 1}
+            outputs = {"plot": name_image_path(plot, name), "out": name_image_path(out, name)}
+            jobs[name] = {**arguments, **changes, "model": find_bundle(model, name), **outputs}
         run_for_images(predict_command, jobs, stars)
         return ""
     # Check all that can be checked without reading pixels: inputs, outputs, and the model.
@@ -223,19 +216,19 @@ def write_prediction(
     star_index, unflagged_count, offsets = 0, 0, []
     # Header cards: the file, its pixel scale, the star list, and what is known of the detector.
     scale_note = ", assumed" if observation.scale_assumed else ""
-    scale = observation.pixel_scale_arcsec
+    catalogue = observation.catalogue and observation.catalogue.name
+    known_cards: list[Card] = [
+        ("CATALOG", catalogue, "star list"),
+        ("GAIN", observation.gain, "electrons per count"),
+        ("SATURATE", observation.saturate, "counts of a saturated pixel"),
+    ]
     cards: list[Card] = [
         ("INFILE", source.path.name, "stars"),
-        ("PIXSCALE", scale, f"[arcsec] width of a pixel{scale_note}"),
+        ("PIXSCALE", observation.pixel_scale_arcsec, f"[arcsec] width of a pixel{scale_note}"),
+        # Unknown values have no card.
+        *(card for card in known_cards if card[1] is not None),
+        *observation.header_cards,
     ]
-    # Unknown values have no card.
-    if observation.catalogue is not None:
-        cards.append(("CATALOG", observation.catalogue.name, "star list"))
-    if observation.gain is not None:
-        cards.append(("GAIN", observation.gain, "electrons per count"))
-    if observation.saturate is not None:
-        cards.append(("SATURATE", observation.saturate, "counts of a saturated pixel"))
-    cards += observation.header_cards
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
     header = (first_piece[1], observation.count, cards, history)
     with prediction_file(out, model.bundle, *header) as file:

@@ -61,6 +61,8 @@ def psf(
     oversampling = oversampling or (8 if for_psfex else 4)
     if for_stdpsf and (at or oversampling != 4):
         raise PredictionError(f"{out}: STDPSF has a --grid, and 4 values per pixel and axis")
+    grid_shape = None if grid is None else _grid_shape(grid)
+    given_positions = np.array([_position(text) for text in at])
     field_model = load_field(model)
     if for_psfex:
         # The polynomial of PSFEx's format does not hold the model exactly: print the error.
@@ -68,16 +70,12 @@ def psf(
         print(f"{out}: within {error:.1g} of the brightest value of {model}, where compared")
         return
     # The given positions, or the nodes of a grid over the positions of the training stars.
-    grid_shape = None if grid is None else _grid_shape(grid)
-    if grid_shape is None:
-        positions = np.array([_position(text) for text in at])
-    else:
-        positions = field_model.grid(*grid_shape)
+    positions = field_model.grid(*grid_shape) if grid_shape else given_positions
     # What the user should know of these positions, then the file.
     for note in _notes(field_model, positions):
         print(f"{model}: {note}")
     reader = "photutils, as STDPSF"
-    if for_stdpsf and grid_shape is not None:
+    if for_stdpsf and grid_shape:
         exchange.write_stdpsf(out, field_model, *grid_shape)
     else:
         exchange.write_grid(out, field_model, positions, oversampling)

@@ -162,7 +162,7 @@ def train_command(
     stamp_px : int, optional
         Side of the stamps, even. [default: 16, more if stars are larger]
     """
-    job = dict(locals())
+    arguments = dict(locals())
     # The three options of the selection are settings of the configuration by shorter names.
     sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
     size_settings: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
@@ -176,18 +176,12 @@ def train_command(
     if all_extensions:
         # Each image of the file gets a model in a folder of its own, by a process of its own, which
         # receives the settings as a tree.
-        jobs = {
-            extension: {
-                **job,
-                "config": settings.model_dump(),
-                "options": image_options,
-                "all_extensions": False,
-                "name": f"{stem}_{extension}",
-                "out": out / extension,
-                "page": name_image_path(page, extension),
-            }
-            for extension, image_options in options_by_image(image[0], options).items()
-        }
+        jobs = {}
+        arguments |= {"config": settings.model_dump(), "all_extensions": False}
+        for extension, image_options in options_by_image(image[0], options).items():
+            outputs = {"out": out / extension, "page": name_image_path(page, extension)}
+            names = {"name": f"{stem}_{extension}", "options": image_options}
+            jobs[extension] = {**arguments, **names, **outputs}
         run_for_images(train_command, jobs, image[0])
     else:
         # One image, or exposures that share a model; options are the same for all.

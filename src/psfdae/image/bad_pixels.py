@@ -209,8 +209,8 @@ def find_constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     return np.asarray(scipy.ndimage.maximum_filter(corner, side, origin=-1))
 
 
-def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, fraction_max: float = 0.3) -> None:
-    """Raise an error if more than a part of the good pixels have the minimum value.
+def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray) -> None:
+    """Raise an error if 30 % of the good pixels or more have the minimum value.
 
     Pixels that lie together, as in the even sky of an image without noise, are allowed, and so are
     counts of few photons, where the next value is as frequent.
@@ -221,8 +221,6 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, fraction_max: float =
         Image, in any unit.
     bad : ndarray of bool, shape (h, w)
         Pixels to ignore.
-    fraction_max : float
-        Fraction of the good pixels from which the sky is taken for clipped.
 
     Raises
     ------
@@ -237,7 +235,7 @@ def refuse_clipped_sky(image: np.ndarray, bad: np.ndarray, fraction_max: float =
     least_value = float(image.min(where=is_good, initial=np.inf))
     at_least = image == least_value
     fraction = float(np.count_nonzero(at_least & is_good) / count)
-    if fraction < fraction_max:
+    if fraction < 0.3:
         return
     # Independent neighbours differ, one at the minimum and one above, with probability 2p(1 − p).
     pairs = ~(bad[:, 1:] | bad[:, :-1])
@@ -379,9 +377,7 @@ def find_dark_area(
 # Single pixels.
 
 
-def find_dead_pixels(
-    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, least_sigma: float = 6.0
-) -> np.ndarray:
+def find_dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Find the pixels (h, w) that are 6 σ below the faintest of their eight neighbours.
 
     Parameters
@@ -390,8 +386,6 @@ def find_dead_pixels(
         Image, and σ of its pixels (`pixel_noise`).
     bad : ndarray of bool, shape (h, w)
         Pixels to ignore.
-    least_sigma : float
-        Minimum depth of a dead pixel, in σ.
 
     Returns
     -------
@@ -405,8 +399,8 @@ def find_dead_pixels(
         # First against the noise of the square, then against the noise of the pixels around.
         clean = fill_bad(band, bad)[0]
         depth = scipy.ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > least_sigma * noise) & ~bad)
-        deep = depth[row, column] > least_sigma * _measure_noise(clean, noise, row, column)
+        row, column = np.nonzero((depth > 6.0 * noise) & ~bad)
+        deep = depth[row, column] > 6.0 * _measure_noise(clean, noise, row, column)
         dead = np.zeros(clean.shape, dtype=bool)
         dead[row[deep], column[deep]] = True
         return dead

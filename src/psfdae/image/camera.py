@@ -254,22 +254,20 @@ def check_camera(
     if sky.correlation > 1.0:
         remarks.append(describe_shared_noise(image.path, sky.correlation))
     # A gain of the header that cannot be right is not used; a given one is.
-    problem = check_gain(image, sky, camera["gain"], camera["read noise"])
-    if problem is None:
-        return values, remarks, sky.correlation
-    provenance = camera["gain"].provenance
-    if provenance == "given":
-        return values, [*remarks, f"{image.path}: {problem}: used as stated"], sky.correlation
-    values["gain"] = CameraValue(None, f"not known, {provenance} does not fit the pixels")
-    remarks.append(
-        f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
-        "subtracted?): not used, errors come from the pixels; "
-        f"{keyword('gain')} states another one"
-    )
-    # On a scale on which the gain does not apply, the saturation of the camera does not, either.
-    limit, provenance = values["saturation"]
-    if limit is not None and provenance != "given" and sky.highest <= 1.0 < limit:
-        values["saturation"] = CameraValue(None, f"not known, {provenance} is of counts")
+    gain, (limit, limit_from) = camera["gain"], values["saturation"]
+    problem = check_gain(image, sky, gain, camera["read noise"])
+    if problem is not None and gain.provenance == "given":
+        remarks.append(f"{image.path}: {problem}: used as stated")
+    elif problem is not None:
+        values["gain"] = CameraValue(None, f"not known, {gain.provenance} does not fit the pixels")
+        remarks.append(
+            f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
+            "subtracted?): not used, errors come from the pixels; "
+            f"{keyword('gain')} states another one"
+        )
+        # Where the gain does not apply, the saturation of the camera does not, either.
+        if limit is not None and limit_from != "given" and sky.highest <= 1.0 < limit:
+            values["saturation"] = CameraValue(None, f"not known, {limit_from} is of counts")
     return values, remarks, sky.correlation
 
 
@@ -305,26 +303,23 @@ def check_saturation(
     ObservationError
         If a given saturation is below the sky.
     """
-    unit, (limit, provenance) = image.unit or "counts", saturation
+    unit, (limit, key), option = image.unit or "counts", saturation, keyword("saturate")
     remarks = []
     # A pixel of the sky cannot be saturated.
     if limit is not None and limit <= sky.level:
-        problem = (
-            f"saturation at {limit:g} {unit} ({provenance}) is below the sky of {sky.level:.4g}"
-        )
-        if provenance == "given":
-            problem += f"; {keyword('saturate')} takes the saturation of a pixel"
+        problem = f"saturation at {limit:g} {unit} ({key}) is below the sky of {sky.level:.4g}"
+        if key == "given":
+            problem += f"; {option} takes the saturation of a pixel"
             raise ObservationError(image.path, problem)
-        saturation = CameraValue(None, f"not known, {provenance} is below the sky")
-        advice = f"not used, {keyword('saturate')} states another one"
-        remarks.append(f"{image.path}: {problem}: {advice}")
+        saturation = CameraValue(None, f"not known, {key} is below the sky")
+        remarks.append(f"{image.path}: {problem}: not used, {option} states another one")
     # A pile-up of the largest value below the level of the header shows a lower saturation.
-    pile_up = None if provenance == "given" else find_clipped_level(image, sky)
+    pile_up = None if key == "given" else find_clipped_level(image, sky)
     if pile_up is not None and (saturation.value is None or pile_up[0] < saturation.value):
         saturation = CameraValue(pile_up[0], "the largest value")
         remarks.append(
             f"{image.path}: {pile_up[1]} pixels have exactly the largest value, {pile_up[0]:g} "
-            f"{unit}: taken as saturated, {keyword('saturate')} states another level"
+            f"{unit}: taken as saturated, {option} states another level"
         )
     return saturation, remarks
 

@@ -282,19 +282,17 @@ class Catalogue:
                 further_columns[name] = column[rows]
         return further_columns
 
-    def _resolve(self, name_wanted: str) -> str | None:
-        """Return the one column of that name, case aside if it is not written exactly so."""
-        names = self.table.colnames
-        return name_wanted if name_wanted in names else name_in_any_case(names, name_wanted)
-
     def _column(self, name: str) -> Column:
-        """Return a column; ObservationError if it does not exist, or is not an array."""
+        """Return a column; ObservationError if it does not exist, or is not an array.
+
+        The case of the name is ignored if no column is written exactly so.
+        """
+        names = self.table.colnames
         try:
-            column_name = self._resolve(name)
+            column_name = name if name in names else name_in_any_case(names, name)
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
         if column_name is None:
-            names = self.table.colnames
             hint = did_you_mean(name, names)
             raise ObservationError(self.path, f"no column {name!r}; found {shorten(names)}{hint}")
         # Coordinates and times are objects of astropy, not arrays.

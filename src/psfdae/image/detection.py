@@ -33,11 +33,11 @@ def _smooth(sky: Sky, threshold: float, fwhm_px: float = 0.0) -> tuple[np.ndarra
     return smooth, threshold * sky.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
 
-def find_sources(sky: Sky, threshold: float, wide_px: float = 7.0) -> dict[str, np.ndarray]:
+def find_sources(sky: Sky, threshold: float) -> dict[str, np.ndarray]:
     """Return columns of a star list as SExtractor names them, positions from 1, ids too.
 
-    Where stars are wide, noise would part a star into many: the image is smoothed by a Gaussian
-    as wide as the brightest sources before it is searched.
+    Where stars have a FWHM of 7 px or more, noise would part a star into many: the image is
+    smoothed by a Gaussian as wide as the brightest sources before it is searched.
 
     Parameters
     ----------
@@ -45,8 +45,6 @@ def find_sources(sky: Sky, threshold: float, wide_px: float = 7.0) -> dict[str, 
         The image without its sky.
     threshold : float
         Minimum height of a source, in σ of the smoothed image.
-    wide_px : float
-        FWHM from which stars are wide.
     """
     # Slightly smoothed at first.
     columns, smoothing = _list_sources(sky, threshold), 0.0
@@ -56,9 +54,7 @@ def find_sources(sky: Sky, threshold: float, wide_px: float = 7.0) -> dict[str, 
             break
         position = np.stack([columns["X_IMAGE"], columns["Y_IMAGE"]], axis=1) - 1
         size = measure_size(sky.signal, sky.bad, position)
-        if size is None or size.fwhm_px < wide_px:
-            break
-        if abs(size.fwhm_px - smoothing) < 0.2 * smoothing:
+        if size is None or size.fwhm_px < 7.0 or abs(size.fwhm_px - smoothing) < 0.2 * smoothing:
             break
         smoothing = size.fwhm_px
         columns = _list_sources(sky, threshold, smoothing)

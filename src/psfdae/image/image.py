@@ -22,7 +22,7 @@ from psfdae.image.layers import NoiseMap
 from psfdae.image.observation import Observation
 from psfdae.image.positions import find_repeated_rows
 from psfdae.image.sky import Sky, sky_around, subtract_sky
-from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut_image
+from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut_image, raise_flag
 from psfdae.image.trails import add_trails
 
 
@@ -107,12 +107,10 @@ class Image(Observation):
             try:
                 with silent():
                     # In the unit of the file, which messages have.
-                    unit, saturate = self.unit_factor, self.saturate
-                    bad_pixels = find_bad_pixels(
-                        image / unit, is_masked, self.data.headers, saturate
-                    )
-                    limit = None if saturate is None else saturate * unit
-                    self.cache.bad_pixels = add_trails(image, bad_pixels, limit)
+                    unit, headers = self.unit_factor, self.data.headers
+                    bad_pixels = find_bad_pixels(image / unit, is_masked, headers, self.saturate)
+                    saturate = self.camera_in_sky_unit()[1]
+                    self.cache.bad_pixels = add_trails(image, bad_pixels, saturate)
             except ClippedSkyError as error:
                 raise ObservationError(self.data.path, str(error)) from None
         return self.cache.bad_pixels
@@ -245,16 +243,10 @@ class Image(Observation):
             # Noise within the stamp of a bright star would include residuals of the PSF.
             _, sky_noise = sky_around(data, is_masked | ~np.isfinite(data), stamp_px)
             sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, self.least_noise), np.nan)
+        centre = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
+        stamps = self._build_stamps(part, data[stamp], is_masked[stamp], sky_noise, centre)
+        raise_flag(stamps.flags, StarFlag.TRUNCATED, is_truncated)
         # A cosmic ray within a pixel of the position: the source may not be a star.
         cosmic = cut_image(self.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]
-        return self._build_stamps(
-            part,
-            data[stamp],
-            is_masked[stamp],
-            sky_noise,
-            centre=np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1),
-            flagged_stars={
-                StarFlag.TRUNCATED: is_truncated,
-                StarFlag.SHARP: np.asarray(cosmic.any(axis=(1, 2))),
-            },
-        )
+        raise_flag(stamps.flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
+        return stamps

@@ -135,31 +135,29 @@ def find_layers(
         If a layer cannot be found, or is not as large as the image; or if options exclude each
         other.
     """
-    factor = image.unit_factor
     layers_of_file = {} if is_cube else find_file_layers(image)
     mask, remarks = find_mask(source, image, layers_of_file.get("mask"))
     # The noise map: the given one; else, if none is given, the file's own.
-    noise_map, maps = None, {kind: getattr(source, kind) for kind in NOISE_MAPS}
-    given_maps = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
+    options = {k: option for k in NOISE_MAPS if (option := getattr(source, k)) is not None}
+    given_maps = {kind: option for kind, option in options.items() if not _is_none(option)}
     if len(given_maps) > 1 or (given_maps and is_cube):
         raise ObservationError(
             source.path,
             "an image takes one map of weight, variance or error, a cube of stamps none",
         )
-    file_mask = mask if source.mask is None else None
+    file_mask, noise_map = mask if source.mask is None else None, None
     notes = [] if file_mask is None else [f"{file_mask.data.label} as mask"]
+    factors = {kind: image.unit_factor**power for kind, power in POWER_OF_SIGMA.items()}
     for kind, option in given_maps.items():
-        noise = _find_layer(image, option, NOISE_MAPS[kind]).times(factor ** POWER_OF_SIGMA[kind])
+        noise = _find_layer(image, option, NOISE_MAPS[kind]).times(factors[kind])
         # A pixel of σ or weight 0 is without data; the map is checked at the same time.
         if zeros := count_zeros(noise, kind):
             remarks.append(f"{noise.path}: {kind} 0, bad pixels: {zeros}")
         noise_map = NoiseMap(noise, kind)
     # Without an option, the map of the image's own file.
-    if all(option is None for option in maps.values()):
-        for kind in layers_of_file.keys() & NOISE_MAPS.keys():
-            file_map = layers_of_file[kind].times(factor ** POWER_OF_SIGMA[kind])
-            noise_map, note = check_noise_map(file_map, kind)
-            notes.insert(0, note)
+    for kind in () if options else layers_of_file.keys() & NOISE_MAPS.keys():
+        noise_map, note = check_noise_map(layers_of_file[kind].times(factors[kind]), kind)
+        notes.insert(0, note)
     if notes:
         line = f"{source.path}: uses {' and '.join(notes)}"
         # A bit may mark pixels that are fine; then good stars would be lost.

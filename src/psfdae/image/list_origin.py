@@ -17,12 +17,12 @@ TOLERANCE_PX = 0.1
 errors must be below half of it."""
 
 
-def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.ndarray, int] | None:
+def find_origin(sky: Sky, xy_px: np.ndarray) -> tuple[int, np.ndarray, int] | None:
     """Find whether positions count from 0 or 1, where the stars of an image show it clearly.
 
     The centroids of the brighter stars lie at the positions of the list, less its origin. Both
-    axes must agree within 0.1 px, with standard errors below 0.05 px. None if too few stars can be
-    used, or neither origin fits.
+    axes must agree within 0.1 px, with standard errors below 0.05 px. None if fewer than eight
+    stars can be used, or neither origin fits.
 
     Parameters
     ----------
@@ -30,8 +30,6 @@ def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.n
         Image less its sky (`signal`), noise per pixel (`noise`) and bad pixels (`bad`).
     xy_px : ndarray, shape (n, 2)
         Positions x, y in px as the list has them, from 0 or from 1.
-    fewest : int
-        Minimum number of usable stars.
 
     Returns
     -------
@@ -56,7 +54,7 @@ def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.n
     snr = stamps[core].sum(axis=(1, 2)) / (5 * np.median(noise, axis=(1, 2)))
     star = np.flatnonzero(~bad[core].any(axis=(1, 2)) & (snr > 20))
     star = star[np.argsort(-snr[star])][:500]
-    if len(star) < fewest:
+    if len(star) < 8:
         return None
     # Centroids (from y, x to x, y) less positions. Gaussian window of σ = 1.5 px, from the middle,
     # 10 iterations, at most 2 px away along each axis; stars that end at that limit found no
@@ -65,7 +63,7 @@ def find_origin(sky: Sky, xy_px: np.ndarray, fewest: int = 8) -> tuple[int, np.n
     centre = find_centroids(stamps[star], start, window_px, rounds=10, reach_px=2.0)[:, ::-1]
     offset = central_pixel(xy_px[star] - 0.5) + centre - xy_px[star]
     offset = offset[(np.abs(centre) < 1.9).all(axis=1)]
-    if len(offset) < fewest:
+    if len(offset) < 8:
         return None
     # Median, and its error 1.25 σ/√n.
     median = np.median(offset, axis=0)

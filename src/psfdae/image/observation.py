@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from psfdae.image.detector_frame import detector_frames
 from psfdae.image.errors import reading, shorten
 from psfdae.image.fits_file import Card, ImageFile, open_pixels, pixel_to_sky
 from psfdae.image.layers import Mask
-from psfdae.image.stamps import Stamps, StarFlag, raise_flag
+from psfdae.image.stamps import Stamps
 
 
 class ListedStars(NamedTuple):
@@ -294,7 +294,6 @@ class Observation(ABC):
         is_masked: np.ndarray,
         noise: np.ndarray,
         centre: np.ndarray,
-        flagged_stars: Mapping[StarFlag, np.ndarray],
     ) -> Stamps:
         """Return stamps (n, s, s) of some of the stars, with flags, positions and columns.
 
@@ -310,8 +309,6 @@ class Observation(ABC):
             σ of the sky, NaN where it is to be estimated.
         centre : ndarray, shape (n, 2)
             Centres from the list, row and column from the middle of the central pixel.
-        flagged_stars : mapping
-            Stars (n,), bool, by the flag that they get.
         """
         # Before infinite pixels become 0: where a saturation is known, +inf is above it, and NaN is
         # not.
@@ -324,8 +321,6 @@ class Observation(ABC):
             is_masked |= ~finite
         unknown, stars = np.full(len(data), np.nan), self.stars.select(part)
         x, y = (unknown, unknown) if self.positions is None else self.positions[part].T
-        for flag, is_flagged in flagged_stars.items():
-            raise_flag(stars.flags, flag, is_flagged)
         columns = stars._asdict()
         del columns["row"]
         return Stamps(

@@ -58,10 +58,10 @@ def gain_advice(candidates: Candidates) -> str:
     )
 
 
-def stamp_advice(
-    candidates: Candidates, stamp_px: int, light_wanted: float = 0.985, step_px: int = 4
-) -> str | None:
+def stamp_advice(candidates: Candidates, stamp_px: int) -> str | None:
     """Return advice on the size of stamps, from the light of the median star and from overlaps.
+
+    A stamp should hold 98.5 % of a star's visible light; changes below 4 px are not advised.
 
     Parameters
     ----------
@@ -69,10 +69,6 @@ def stamp_advice(
         The measured stars.
     stamp_px : int
         Current side of the stamps.
-    light_wanted : float
-        Fraction of a star's visible light that a stamp should hold.
-    step_px : int
-        Minimum difference of the sides for which advice is given.
 
     Returns
     -------
@@ -84,8 +80,8 @@ def stamp_advice(
     sides = np.arange(8, typical.shape[-1] + 1, 2)
     light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
     # The first side that holds enough light.
-    side_px = int(sides[np.argmax(light >= light_wanted)])
-    if abs(side_px - stamp_px) < step_px:
+    side_px = int(sides[np.argmax(light >= 0.985)])
+    if abs(side_px - stamp_px) < 4:
         return None
     # How many stamps of either size have a second star.
     overlap = ", ".join(
@@ -93,7 +89,7 @@ def stamp_advice(
         for side in (stamp_px, side_px)
     )
     return (
-        f"stamp size: {100 * light_wanted:g} % of the median star's light are within {side_px} px; "
+        f"stamp size: 98.5 % of the median star's light are within {side_px} px; "
         f"another star of the list stands in {overlap}: {keyword('stamp_px', side_px)} is worth a "
         "trial"
     )

@@ -234,14 +234,11 @@ def noise_correlation(deviation: np.ndarray) -> float:
 
 
 def correlate_sources(
-    deviation: np.ndarray,
-    lags: Sequence[tuple[int, int]],
-    noise_correlations: np.ndarray,
-    least_sigma: float = 8.0,
+    deviation: np.ndarray, lags: Sequence[tuple[int, int]], noise_correlations: np.ndarray
 ) -> np.ndarray:
     """Return the autocorrelation of bright sources at lags (rows, columns), its median, 0 … 1.
 
-    It is 1 with fewer than five sources of `least_sigma` that have no bad pixel within 6 px.
+    It is 1 with fewer than five sources of 8 σ that have no bad pixel within 6 px.
 
     Parameters
     ----------
@@ -251,12 +248,10 @@ def correlate_sources(
         Offsets of up to 2 px.
     noise_correlations : ndarray, shape (k,)
         Correlation of the noise at these lags.
-    least_sigma : float
-        Minimum height of the brightest pixel of a source.
     """
     # Local maxima, the 300 brightest, and windows of 9 × 9 px about them and a lag away.
     clean = np.nan_to_num(deviation)
-    is_peak = (clean > least_sigma) & (clean == scipy.ndimage.maximum_filter(clean, 9))
+    is_peak = (clean > 8.0) & (clean == scipy.ndimage.maximum_filter(clean, 9))
     row, column = np.nonzero(is_peak)
     brightest = np.argsort(-clean[row, column], kind="stable")[:300]
     row, column = row[brightest] + 2, column[brightest] + 2

@@ -73,10 +73,8 @@ class SourceSize:
         return next(sides, self.sides[-1])
 
 
-def measure_size(
-    data: np.ndarray, bad: np.ndarray, position: np.ndarray, reach_px: int = 72, stars_max: int = 60
-) -> SourceSize | None:
-    """Measure the size of the stars of an image.
+def measure_size(data: np.ndarray, bad: np.ndarray, position: np.ndarray) -> SourceSize | None:
+    """Measure the size of the 60 brightest stars of an image, in windows with a radius of 72 px.
 
     Parameters
     ----------
@@ -85,11 +83,7 @@ def measure_size(
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
     position : ndarray, shape (n, 2)
-        (x, y) of stars, of which the brightest are used; NaN where unknown.
-    reach_px : int
-        Radius of the windows in which stars are measured.
-    stars_max : int
-        Maximum number of stars that are measured.
+        (x, y) of stars, NaN where unknown.
 
     Returns
     -------
@@ -105,9 +99,9 @@ def measure_size(
         return None
     clean = np.where(bad, 0.0, data)
     light = ndimage.uniform_filter(clean, 17, np.float64, mode="constant")[tuple(pixel.T)]
-    brightest = pixel[np.argsort(-light, kind="stable")[:stars_max]]
+    brightest = pixel[np.argsort(-light, kind="stable")[:60]]
     # Windows (n, s, s) about them; pixels off the image are ignored.
-    windows_at = (data.shape, brightest[:, 1], brightest[:, 0], 2 * reach_px + 1, 0)
+    windows_at = (data.shape, brightest[:, 1], brightest[:, 0], 145, 0)
     windows, inside, _ = cut_image(clean, *windows_at)
     is_measured = inside & (cut_image(bad, *windows_at)[0] == 0)
     # The centre under a window as wide as the star, from the first profile.

@@ -264,13 +264,11 @@ def narrowest_group(size: np.ndarray) -> tuple[float, float]:
     return float(np.median(group)), float(robust_scatter(group))
 
 
-def misfit(
-    aligned_stamps: np.ndarray, position: np.ndarray, noise: np.ndarray, companions: int = 12
-) -> np.ndarray:
+def misfit(aligned_stamps: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return how unlike its neighbours each star is, relative to the median star, shape (n,).
 
-    A star is compared with the nearest stars, pixel by pixel: its difference from their median in
-    units of their robust scatter, as a root mean square over the stamp, or over the worst 3 × 3
+    A star is compared with the 12 nearest stars, pixel by pixel: its difference from their median
+    in units of their robust scatter, as a root mean square over the stamp, or over the worst 3 × 3
     pixels of its core, which reveal a close companion or a flat or hollow core. Where the PSF
     varies, so do the neighbours; a companion or a cosmic ray lies where they agree. The median star
     has 1, in its worst pixels 1/1.2, because the worst pixels of good stars scatter more than their
@@ -284,8 +282,6 @@ def misfit(
         (x, y) in the image; if one is not finite, all stars are neighbours of each other.
     noise : ndarray, shape (n,)
         Ratio of the RMS of a pixel to the flux.
-    companions : int
-        Number of nearest stars with which a star is compared.
     """
     count, side = len(aligned_stamps), aligned_stamps.shape[-1]
     if count < 4:
@@ -299,8 +295,8 @@ def misfit(
 
     local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
     # Neighbours of each star; all stars where there are few, or positions are not known.
-    if np.isfinite(position).all() and count > companions:
-        neighbours = scipy.spatial.cKDTree(position).query(position, k=companions + 1)[1]
+    if np.isfinite(position).all() and count > 12:
+        neighbours = scipy.spatial.cKDTree(position).query(position, k=13)[1]
         companion_rows = (rows[rows != star] for star, rows in enumerate(neighbours))
         local_medians = (compute_statistics(aligned_stamps[rows]) for rows in companion_rows)
     else:

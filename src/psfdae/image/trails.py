@@ -33,9 +33,7 @@ class Line(NamedTuple):
         return np.asarray(x * np.cos(self.angle_rad) + y * np.sin(self.angle_rad))
 
 
-def add_trails(
-    image: np.ndarray, bad_pixels: BadPixels, saturate: float | None = None
-) -> BadPixels:
+def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> BadPixels:
     """Add the pixels of trails and spikes to the bad pixels of an image (h, w).
 
     Without a trail or spike, they are returned with the sky of the image, which was measured for
@@ -49,8 +47,8 @@ def add_trails(
         Finite pixels, in the unit of `saturate`.
     bad_pixels : BadPixels
         Bad pixels of other kinds, which are left out of the search.
-    saturate : float, optional
-        Counts from which a pixel is saturated; without it, no spikes are searched.
+    saturate : float
+        Value from which a pixel is saturated; infinite if unknown: no spikes are searched then.
     """
     from astropy.nddata import block_reduce, block_replicate
 
@@ -63,7 +61,7 @@ def add_trails(
         values = block_reduce(np.where(hidden, np.nan, image), size, np.nanmean)
         hidden = np.isnan(values)
     # Saturated cores stay unchanged, so that these stars are flagged as saturated.
-    is_saturated = (values >= saturate) & ~hidden if saturate else np.zeros_like(hidden)
+    is_saturated = (values >= saturate) & ~hidden
     is_core = scipy.ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
     values = np.where(hidden, 0.0, values)
     try:
