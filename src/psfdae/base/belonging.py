@@ -108,20 +108,20 @@ def _difference(
     if not (isinstance(first, Mapping) and isinstance(second, Mapping)):
         return None if first == second else (name, first, second)
     # Two groups: a key that a side lacks is "nothing" there.
-    keys, stated_parts = [*{**first, **second}], set()
+    keys, required_parts = [*{**first, **second}], set()
     if is_partial:
         # If both sides have one part of a group, such as aberrations, they have all of its parts:
         # then a part that one side lacks is a difference.
         parts = [{k for k, v in side.items() if isinstance(v, Mapping)} for side in (first, second)]
-        stated_parts = parts[0] | parts[1] if parts[0] & parts[1] else set()
-        keys = sorted({*first} & {*second} | stated_parts)
+        required_parts = parts[0] | parts[1] if parts[0] & parts[1] else set()
+        keys = sorted({*first} & {*second} | required_parts)
     for key in keys:
         # Titles do not change the bytes. Static PSFs have no random aberrations; the size of these
         # is compared by its own key in `STARS`.
         if key not in ("name", "jitter_waves"):
-            absent = {} if key in stated_parts else "nothing"
+            absent = {} if key in required_parts else "nothing"
             values = first.get(key, absent), second.get(key, absent)
-            is_optional = is_partial and key not in stated_parts
+            is_optional = is_partial and key not in required_parts
             if (difference := _difference(f"{name}.{key}", *values, is_optional)) is not None:
                 return difference
     return None

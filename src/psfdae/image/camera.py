@@ -257,13 +257,13 @@ def check_camera(
     gain, (limit, limit_from) = camera["gain"], values["saturation"]
     problem = check_gain(image, sky, gain, camera["read noise"])
     if problem is not None and gain.provenance == "given":
-        remarks.append(f"{image.path}: {problem}: used as stated")
+        remarks.append(f"{image.path}: {problem}: used as given")
     elif problem is not None:
         values["gain"] = CameraValue(None, f"not known, {gain.provenance} does not fit the pixels")
         remarks.append(
             f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
             "subtracted?): not used, errors come from the pixels; "
-            f"{keyword('gain')} states another one"
+            f"{keyword('gain')} sets another one"
         )
         # Where the gain does not apply, the saturation of the camera does not, either.
         if limit is not None and limit_from != "given" and sky.highest <= 1.0 < limit:
@@ -312,14 +312,14 @@ def check_saturation(
             problem += f"; {option} takes the saturation of a pixel"
             raise ObservationError(image.path, problem)
         saturation = CameraValue(None, f"not known, {key} is below the sky")
-        remarks.append(f"{image.path}: {problem}: not used, {option} states another one")
+        remarks.append(f"{image.path}: {problem}: not used, {option} sets another one")
     # A pile-up of the largest value below the level of the header shows a lower saturation.
     pile_up = None if key == "given" else find_clipped_level(image, sky)
     if pile_up is not None and (saturation.value is None or pile_up[0] < saturation.value):
         saturation = CameraValue(pile_up[0], "the largest value")
         remarks.append(
             f"{image.path}: {pile_up[1]} pixels have exactly the largest value, {pile_up[0]:g} "
-            f"{unit}: taken as saturated, {option} states another level"
+            f"{unit}: taken as saturated, {option} sets another level"
         )
     return saturation, remarks
 

@@ -164,7 +164,7 @@ def find_layers(
         if file_mask is not None and (bad_fraction := float(np.mean(file_mask.read()))) > 0.2:
             line += (
                 f"; {100 * bad_fraction:.0f} % of the pixels have a bit of {file_mask.data.label}: "
-                f"state {keyword('bad_bits')}, or {keyword('mask', 'none')}"
+                f"set {keyword('bad_bits')}, or {keyword('mask', 'none')}"
             )
         remarks.insert(0, line)
     return mask, noise_map, remarks

@@ -346,6 +346,6 @@ def add_origin(table: Catalogue, columns: Positions, image: Image) -> tuple[Posi
     sentence = (
         f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
         f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
-        f"{keyword('origin')} states it"
+        f"{keyword('origin')} sets it"
     )
     return replace(columns, origin=origin), [sentence]

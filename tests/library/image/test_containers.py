@@ -300,7 +300,7 @@ def test_err_and_dq_of_the_file_are_used_and_said(tmp_path, image, place, bad):
 def test_many_masked_pixels_are_said_with_the_option_that_helps(tmp_path, image, place, bad):
     harmless = 4 * (np.arange(bad.size).reshape(bad.shape) % 3 == 0)
     path = pipeline_file(tmp_path / "cal.fits", image, bad + harmless)
-    with pytest.raises(Error, match=r"47 % of the pixels have a bit of DQ: state bad_bits="):
+    with pytest.raises(Error, match=r"47 % of the pixels have a bit of DQ: set bad_bits="):
         Stars.from_image(path, catalogue=place)
     counts = verdicts(path, place, bad_bits=1)
     assert counts == verdicts(image, place, mask=bad, **CAMERA)
