@@ -27,7 +27,14 @@ from typing import Protocol
 
 import numpy as np
 
-from psfdae.optics.propagation import Precision, complex_field, image_points, real_dtype, run_grids
+from psfdae.optics.propagation import (
+    Precision,
+    StampPropagator,
+    complex_field,
+    image_points,
+    real_dtype,
+    run_grids,
+)
 from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, count_samples
 from psfdae.optics.seeing import WholePeriod
 from psfdae.optics.wavefronts import (
@@ -50,6 +57,9 @@ class Sampling(Protocol):
 
     product_cost: float
     """Measured time for a product of polynomials, over the time for a single direction."""
+
+    propagator: StampPropagator | None
+    """Faster propagation of stamps without derivatives, if there is one."""
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
@@ -116,6 +126,7 @@ class PointSampling(SeparableSampling):
         self.pixel_weights = np.vstack([below, above]).astype(self.dtype)
         # Waves times P_a(x), by the degree a.
         self._weighted_waves: dict[int, np.ndarray] = {}
+        self.propagator = StampPropagator(pupil, stamp_px, pixel, precision=precision)
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate along x as `Sampling` does, to all points."""
@@ -244,7 +255,9 @@ class ModalStamps:
             Fraction of the light through the pupil on each pixel.
         """
         sampling = self._sampling
-        # The field by two products of matrices, and the light on the pixels from its intensity.
+        if sampling.propagator is not None:
+            return sampling.propagator(self.opd(coefficients), offset_px)
+        # The field by two transforms, and the light on the pixels from its intensity.
         (rows,) = sampling.along_x(self._pupil_fields(coefficients, offset_px))
         (field,) = sampling.along_y(rows)
         return sampling.to_pixels(field.real**2 + field.imag**2)

@@ -22,6 +22,7 @@ need far more points.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Any, Literal
@@ -284,10 +285,11 @@ class StampPropagator:
 
         New pages of memory would take more time than the arithmetic.
         """
-        buffers: dict[tuple[int, ...], Any] = vars(self._scratch).setdefault(name, {})
-        if shape not in buffers:
-            buffers[shape] = self._array(np.empty(shape, self.real_dtype))
-        return buffers[shape]
+        # One array for each name, as large as any batch has needed; a smaller one uses its start.
+        buffers, size = vars(self._scratch), math.prod(shape)
+        if name not in buffers or len(buffers[name]) < size:
+            buffers[name] = self._array(np.empty(size, self.real_dtype))
+        return buffers[name][:size].reshape(shape)
 
 
 def run_grids(

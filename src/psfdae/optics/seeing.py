@@ -113,6 +113,7 @@ class WholePeriod:
     """
 
     product_cost = 0.6
+    propagator = None
 
     def __init__(self, pupil: Pupil, precision: Precision) -> None:
         from scipy import fft  # here, because every configuration knows the profiles

@@ -6,7 +6,6 @@ stamps and their derivatives by the coefficients. All searches and samples of a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import get_args
@@ -14,8 +13,7 @@ from typing import get_args
 import numpy as np
 
 from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
-from psfdae.optics.propagation import Precision, StampPropagator, run_grids
-from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.propagation import Precision
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.bounds.posterior import Likelihood
@@ -89,28 +87,9 @@ class StampModel:
         -------
         ndarray, shape (n, d, d), float32
         """
-        side, pixel = self.framing.stamp_px, self.telescope.pixel
-        coefficients = self.coefficients(z, field).astype(np.float32)
-        stamps = np.empty((len(z), side, side), np.float32)
-
-        def prepare(samples: int) -> Callable[[np.ndarray], None]:
-            # The OPD is a sum of monomials over the pupil, Σ c_j M_j.
-            pupil = annular_pupil(samples, self.telescope.obscuration)
-            images = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
-            modes = images.reshape(len(images), -1).astype(np.float32)
-            kernel = StampPropagator(pupil, side, pixel, precision="complex64")
-
-            def propagate(draw: np.ndarray) -> None:
-                opd = (coefficients[draw] @ modes).reshape(-1, *images.shape[1:])
-                # Light outside the stamp is lost: the sum is normalised to 1, as for all stamps.
-                stamps[draw] = normalise_flux(kernel(opd, offset[draw]))[0]
-
-            return propagate
-
-        # Draws that need the same pupil grid are propagated together.
-        samples = self._operators["complex64"].samples(coefficients, offset)
-        run_grids(samples, self.optics.batch, 1, prepare)
-        return stamps
+        stamps = self._operators["complex64"].stamps(self.coefficients(z, field), offset)
+        # Light outside the stamp is lost: the sum is normalised to 1, as for all stamps.
+        return normalise_flux(stamps)[0]
 
     def derivatives(
         self,
