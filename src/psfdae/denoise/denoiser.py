@@ -148,7 +148,7 @@ class DenoisedStars(NamedTuple):
             name: array[rows] if isinstance(array, np.ndarray) else array
             for name, array in self._asdict().items()
         }
-        return DenoisedStars(**values | {"photometry": self.photometry.part(rows)})
+        return DenoisedStars(**values | {"photometry": self.photometry.select(rows)})
 
     def centre_columns(self) -> dict[str, np.ndarray]:
         """Return the columns on centres, and on all errors but the flux error.

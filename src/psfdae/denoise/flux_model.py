@@ -20,13 +20,13 @@ are known should be NaN. No star influences another one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
+from psfdae.base.rows import Rows
 from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.stars.moments import SIGMA_OF_MAD
 
@@ -148,7 +148,7 @@ def signal_to_noise(noise: float, area: float) -> float:
 
 
 @dataclass(frozen=True)
-class Photometry:
+class Photometry(Rows):
     """Photometry of n stamps, in the unit of the stamps; NaN where it is not possible.
 
     Attributes
@@ -174,19 +174,6 @@ class Photometry:
     images: np.ndarray
     is_used: np.ndarray
     flags: np.ndarray
-
-    def part(self, rows: slice) -> Photometry:
-        """Return the photometry of a part of the stamps."""
-        return Photometry(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    @classmethod
-    def join(cls, parts: Sequence[Photometry]) -> Photometry:
-        """Return the photometry of the stamps of several, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        # Column by column, from all parts.
-        columns = ([getattr(p, field.name) for p in parts] for field in fields(cls))
-        return cls(*map(np.concatenate, columns))
 
     def scale_flux(self, factor: np.ndarray) -> Photometry:
         """Return the same light with fluxes times a factor (n,), the rest of it being sky."""

@@ -109,6 +109,42 @@ def poisson_information(counts: np.ndarray, mean: np.ndarray, slopes: np.ndarray
     return deviance, score, weighted_slopes @ slopes.swapaxes(1, 2)
 
 
+def add_normal_prior(
+    likelihood: Evaluation, parameters: np.ndarray, precision: np.ndarray
+) -> Evaluation:
+    """Return the posterior of parameters whose priors are normal about 0, with its derivatives.
+
+    Parameters
+    ----------
+    likelihood : Evaluation
+        Deviance (n,), score (n, K) and information (n, K, K), as of `poisson_information`.
+    parameters : ndarray, shape (n, K)
+        Parameters x at which the likelihood was evaluated.
+    precision : ndarray, shape (K,)
+        Inverse variance 1/σ² of each prior; 0 where it is flat.
+
+    Returns
+    -------
+    height, slope, information : ndarray, shapes (n,), (n, K) and (n, K, K)
+        Logarithm of the posterior, its slope, and its expected information.
+    """
+    # ln p = −½ (deviance + Σ x²/σ²), slope = score − x/σ², information + 1/σ². A tiny information
+    # under a flat prior keeps all matrices regular.
+    deviance, score, information = likelihood
+    height = -0.5 * (deviance + (precision * parameters**2).sum(axis=1))
+    information = information + np.diag(np.maximum(precision, 1e-9))
+    return height, score - precision * parameters, information
+
+
+def compute_deviance_limit(pixels: np.ndarray | int, sigma: float = 4.0) -> np.ndarray:
+    """Return the χ² or deviance above which a model image does not explain a star.
+
+    For the true image both have the mean P and the variance 2P of P pixels; the limit is `sigma`
+    standard deviations above the mean.
+    """
+    return np.asarray(pixels + sigma * np.sqrt(2.0 * pixels))
+
+
 def combine_images(
     score: np.ndarray, information: np.ndarray, shared_count: int
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -21,10 +21,12 @@ from psfdae.sensing.climbing import (
     Evaluation,
     Peaks,
     Steps,
+    add_normal_prior,
     climb,
     combine_images,
     poisson_information,
 )
+from psfdae.sensing.modes import squared_distance
 from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, WavefrontSearch
 from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
@@ -174,20 +176,17 @@ class TelescopePosterior:
         # Parameters without an image keep a height of −∞.
         height, score = np.full(count, -np.inf), np.zeros((count, size))
         information = np.tile(np.eye(size), (count, 1, 1))
+        # Normal prior of the numbers, flat priors of positions, fluxes and skies.
+        precision = np.repeat([1.0, 0.0], [q, size - q])
         for row, values in enumerate(parameters):
             with suppress(RayTracingError, SamplingError):
                 deviance, star_score, star_information = self.evaluate_stars(values)
-                height[row] = -0.5 * (deviance.sum() + (values[:q] ** 2).sum())
                 # The numbers are shared by all stars; the four parameters of each star have rows of
                 # their own.
-                (score[row],), (information[row],) = combine_images(
-                    star_score[None], star_information[None], q
-                )
-                # Normal prior of the numbers, and a tiny information on positions, fluxes and
-                # skies, so that no matrix is singular.
-                score[row, :q] -= values[:q]
-                information[row, range(q), range(q)] += 1.0
-                information[row, range(q, size), range(q, size)] += 1e-9
+                combined = combine_images(star_score[None], star_information[None], q)
+                likelihood = deviance.sum(keepdims=True), *combined
+                posterior = add_normal_prior(likelihood, values[None], precision)
+                (height[row],), (score[row],), (information[row],) = posterior
         return height, score, information
 
     def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
@@ -246,7 +245,7 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     # The 500 explained stars with the most light in units of the sky noise: the time grows with
     # their number.
     optics, best_modes = search.optics, modes.best_modes
-    best_modes = best_modes.take(np.flatnonzero(search.is_explained(best_modes)))
+    best_modes = best_modes.select(search.is_explained(best_modes))
     stars = best_modes.star
     # Flux is the last but one parameter of a mode, in units of `search.flux`.
     light = search.flux[stars] * best_modes.parameters[:, -2]
@@ -351,8 +350,7 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
         # Squared Mahalanobis distance of each mode; in this order, the first mode of each star is
         # the nearest.
         gap = mode_coefficients - posterior.coefficients(t)[row]
-        weighted_gap = np.linalg.solve(covariance, gap[:, :, None])[:, :, 0]
-        order = np.lexsort((np.einsum("mk,mk->m", gap, weighted_gap), modes.star))
+        order = np.lexsort((squared_distance(gap[:, None], covariance)[:, 0], modes.star))
         nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
         # Gauss–Newton step of the numbers, with their prior.
         slopes = posterior.slopes(t)

@@ -19,12 +19,22 @@ import numpy as np
 
 from psfdae.base.errors import Error
 from psfdae.base.rng import stream
+from psfdae.base.rows import Rows
 from psfdae.image.sky import border_median, border_scatter
 from psfdae.image.stamps import Stamps
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
-from psfdae.sensing.climbing import Evaluation, Steps, climb, group_maximum, poisson_information
+from psfdae.sensing.climbing import (
+    Evaluation,
+    Steps,
+    add_normal_prior,
+    climb,
+    compute_deviance_limit,
+    group_maximum,
+    poisson_information,
+)
+from psfdae.sensing.modes import merge_modes
 from psfdae.sensing.sampling import sample_around
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.telescope.field import Terms
@@ -208,12 +218,8 @@ class Photons:
 
     @property
     def deviance_limit(self) -> np.ndarray:
-        """Deviance above which a model image does not explain a star, (n,).
-
-        Like χ², the deviance of the true image has the mean P and the variance 2P for P pixels;
-        the limit is four standard deviations above the mean.
-        """
-        return np.asarray(self.pixels + 4.0 * np.sqrt(2.0 * self.pixels))
+        """Deviance above which a model image does not explain a star, (n,)."""
+        return compute_deviance_limit(self.pixels)
 
     @property
     def usable(self) -> np.ndarray:
@@ -222,7 +228,7 @@ class Photons:
 
 
 @dataclass(frozen=True)
-class StarModes:
+class StarModes(Rows):
     """Modes of the posteriors of stars, M in all, sorted by star, the best mode first.
 
     Attributes
@@ -246,18 +252,14 @@ class StarModes:
     evidence: np.ndarray
     deviance: np.ndarray
 
-    def take(self, modes: np.ndarray) -> StarModes:
-        """Return modes by their indices, in the given order."""
-        return StarModes(*(values[modes] for values in vars(self).values()))
-
     def select_stars(self, stars: np.ndarray) -> StarModes:
         """Return the modes of some stars."""
-        return self.take(np.flatnonzero(np.isin(self.star, stars)))
+        return self.select(np.isin(self.star, stars))
 
     @property
     def best_modes(self) -> StarModes:
         """Best mode of each star."""
-        return self.take(np.flatnonzero(np.diff(self.star, prepend=-1)))
+        return self.select(np.flatnonzero(np.diff(self.star, prepend=-1)))
 
     @property
     def probability(self) -> np.ndarray:
@@ -305,12 +307,22 @@ class WavefrontSearch:
         usable = np.flatnonzero(self.photons.usable)
         if not usable.size:
             raise SensingError("no star has enough usable pixels")
-        return join_modes([self._find_block(block) for block in self._blocks(usable)])
+        return StarModes.join([self._find_block(block) for block in self._blocks(usable)])
 
     def draw_parameters(self, modes: StarModes) -> np.ndarray:
         """Draw (m, `CHAINS.draws`, K + 4) parameters from the posteriors of stars with modes."""
         blocks = self._blocks(modes.best_modes.star)
         return np.concatenate([self._draw_block(modes.select_stars(block)) for block in blocks])
+
+    @property
+    def prior_precision(self) -> np.ndarray:
+        """Inverse variance of the prior of a star's parameters, (K + 4,).
+
+        Coefficients are normal with σ = 1; the position has a wide prior, σ = side of the stamp,
+        flux and sky a flat one.
+        """
+        k, position_precision = self.optics.coefficient_count, self.optics.stamp_px**-2.0
+        return np.array([1.0] * k + [position_precision] * 2 + [0.0] * 2)
 
     def is_explained(self, modes: StarModes) -> np.ndarray:
         """Return True for modes with a deviance that is usual for the true image."""
@@ -341,8 +353,8 @@ class WavefrontSearch:
             is_reachable = (np.abs(twins[:, :count]) <= MAX_Z).all(axis=1)
             if is_reachable.any():
                 twin_modes = self._climb(fresh.star[is_reachable], twins[is_reachable])
-                fresh = join_modes([fresh, twin_modes])
-            modes = [separate_modes(join_modes([*modes, fresh]))]
+                fresh = StarModes.join([fresh, twin_modes])
+            modes = [separate_modes(StarModes.join([*modes, fresh]))]
             # The next round is for stars that are not explained, and for stars with an additional
             # mode of a probability above 1 %: there may be more.
             best_modes = modes[0].best_modes
@@ -409,11 +421,6 @@ class WavefrontSearch:
         """Climb from starts (M, K + 4) of stars (M,) to modes."""
         optics, photons, k = self.optics, self.photons, self.optics.coefficient_count
         limit = np.array([MAX_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
-        # Normal priors of the coefficients, σ = 1, and of the position, σ = side of the stamp. A
-        # tiny information on flux and sky keeps all matrices regular.
-        prior_variance = np.array([1.0] * k + [optics.stamp_px**2] * 2 + [np.inf] * 2)
-        prior_information = np.maximum(1.0 / prior_variance, 1e-9)
-        diagonal = range(k + 4)
 
         def evaluate(members: np.ndarray, parameters: np.ndarray) -> Evaluation:
             stars, z, place = star[members], parameters[:, :k], parameters[:, k : k + 2]
@@ -422,15 +429,13 @@ class WavefrontSearch:
             directions = optics.terms.sd[stars][:, :, None] * optics.terms.to_modes[stars]
             stamps, slopes = optics.derivatives(modes, directions)
             mean, slopes = self.predict_counts(stars, stamps, slopes, parameters[:, k:])
-            deviance, score, information = poisson_information(photons.counts[stars], mean, slopes)
-            score -= parameters / prior_variance
-            information[:, diagonal, diagonal] += prior_information
-            return -0.5 * (deviance + self._prior_penalty(parameters)), score, information
+            likelihood = poisson_information(photons.counts[stars], mean, slopes)
+            return add_normal_prior(likelihood, parameters, self.prior_precision)
 
         steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
         peaks = climb(evaluate, start, limit, steps, star)
-        # Height = −½ (deviance + penalty of the prior).
-        deviance = -2.0 * peaks.height - self._prior_penalty(peaks.parameters)
+        # Height = −½ (deviance + Σ x²/σ²).
+        deviance = -2.0 * peaks.height - peaks.parameters**2 @ self.prior_precision
         return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
 
     def _draw_block(self, modes: StarModes) -> np.ndarray:
@@ -455,7 +460,7 @@ class WavefrontSearch:
             no_slopes = np.empty((len(star), 0, stamps.shape[1]))
             mean, no_slopes = self.predict_counts(star, stamps, no_slopes, parameters[:, k:])
             deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
-            height = -0.5 * (deviance + self._prior_penalty(parameters))
+            height = -0.5 * (deviance + parameters**2 @ self.prior_precision)
             # A star far from its stamp is impossible; a finite value keeps differences finite.
             return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
 
@@ -464,15 +469,6 @@ class WavefrontSearch:
         rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
         mixture = modes.parameters, modes.covariance, modes.evidence
         return sample_around(log_posterior, twin, owner, *mixture, rngs)
-
-    def _prior_penalty(self, parameters: np.ndarray) -> np.ndarray:
-        """Return −2 ln of the prior of parameters (m, K + 4), (m,).
-
-        Coefficients are normal with σ = 1; the position has a wide prior, σ = side of the stamp.
-        """
-        k = self.optics.coefficient_count
-        place = parameters[:, k : k + 2] / self.optics.stamp_px
-        return np.asarray((parameters[:, :k] ** 2).sum(axis=1) + (place**2).sum(axis=1))
 
     def predict_counts(
         self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, star_parameters: np.ndarray
@@ -501,25 +497,14 @@ class WavefrontSearch:
         return np.maximum(mean, 0.01 * sky), slopes
 
 
-def join_modes(parts: list[StarModes]) -> StarModes:
-    """Concatenate the modes of several searches."""
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return StarModes(*(np.concatenate(values) for values in columns))
-
-
 def separate_modes(modes: StarModes) -> StarModes:
     """Return the likely modes without duplicates, sorted by star, the best mode first.
 
     Modes whose evidence is 12 below the best one of their star (6e-6 of its mass) are dropped.
     """
     is_likely = modes.evidence > group_maximum(modes.evidence, modes.star) - 12.0
-    # Modes of each star in descending order of the evidence.
-    separate: dict[int, list[int]] = {}
-    order = np.lexsort((-modes.evidence, modes.star))
-    for mode in order[is_likely[order]]:
-        # A mode is new if it is a standard deviation or more from all better ones of its star.
-        better_modes = separate.setdefault(int(modes.star[mode]), [])
-        offsets = [(modes.parameters[mode] - modes.parameters[k], k) for k in better_modes]
-        if not any(gap @ np.linalg.solve(modes.covariance[k], gap) < 1.0 for gap, k in offsets):
-            better_modes.append(int(mode))
-    return modes.take(np.array([mode for rows in separate.values() for mode in rows], int))
+    modes = modes.select(is_likely)
+    # One mode for each maximum.
+    maximum = merge_modes(modes.parameters, modes.covariance, modes.evidence, modes.star)
+    modes = modes.select(np.unique(maximum))
+    return modes.select(np.lexsort((-modes.evidence, modes.star)))

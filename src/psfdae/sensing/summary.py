@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.sensing.modes import squared_distance
 from psfdae.sensing.stars import StarModes
 
 
@@ -27,11 +28,10 @@ def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
     """
     nearest = np.empty(draws.shape[:2], int)
     for row, star in enumerate(modes.best_modes.star):
-        # Squared distance (x − μ)ᵀ C⁻¹ (x − μ) of all draws from all modes of the star.
+        # Distances of all draws from all modes of the star.
         numbers = np.flatnonzero(modes.star == star)
-        gap = draws[row][None] - modes.parameters[numbers][:, None]
-        precision = np.linalg.inv(modes.covariance[numbers])
-        distance = np.einsum("mni,mij,mnj->mn", gap, precision, gap)
+        gap = draws[row] - modes.parameters[numbers][:, None]
+        distance = squared_distance(gap, modes.covariance[numbers])
         nearest[row] = numbers[distance.argmin(axis=0)]
     return nearest
 

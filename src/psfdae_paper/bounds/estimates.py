@@ -283,7 +283,8 @@ def sample_stars(
     posteriors = StarPosteriors(stars.noisy[level], likelihood, build_stamp_model(config))
     # Bounds need every mode: more starts than in a method, and more for doubtful stars.
     modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=2.0)
-    modes = separate(modes + climb(get_true_modes(posteriors.model, product, stars), posteriors))
+    true_modes = climb(get_true_modes(posteriors.model, product, stars), posteriors)
+    modes = separate(Modes.join([modes, true_modes]))
     # A star's draws do not depend on the other stars: each has a stream by its number.
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]

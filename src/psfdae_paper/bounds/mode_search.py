@@ -10,13 +10,19 @@ matches.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import reduce
 from itertools import product
 
 import numpy as np
 
 from psfdae.optics.wavefronts import MONOMIALS
-from psfdae.sensing.climbing import Peaks, Steps, poisson_information
+from psfdae.sensing.climbing import (
+    Evaluation,
+    Peaks,
+    Steps,
+    add_normal_prior,
+    compute_deviance_limit,
+    poisson_information,
+)
 from psfdae.sensing.climbing import climb as climb_posterior
 from psfdae_paper.bounds.modes import Knowledge, Modes, select_largest, separate
 from psfdae_paper.bounds.posterior import Bank, group_by_field, list_jitters, score_bank
@@ -78,8 +84,8 @@ def search(
                 None if field is None else field[group],
             )
             matches.append(replace(in_group, star=stars[group][in_group.star]))
-        starts = reduce(Modes.__add__, matches)
-        return starts + recentre(starts, posteriors)
+        starts = Modes.join(matches)
+        return Modes.join([starts, recentre(starts, posteriors)])
 
     # First from a few matches of every star.
     modes = climb(bank_starts(np.arange(len(posteriors.noisy)), fields, offsets), posteriors)
@@ -93,10 +99,10 @@ def search(
             starts = bank_starts(misfits, 16, 16)
         else:
             starts = recentre(place_corners(modes, misfits), posteriors)
-        modes = climb(modes + starts, posteriors)
+        modes = climb(Modes.join([modes, starts]), posteriors)
     # Finally in other fields and at other offsets that give nearly the same image.
     if in_all_fields:
-        modes = climb(modes + find_twins(modes, posteriors), posteriors)
+        modes = climb(Modes.join([modes, find_twins(modes, posteriors)]), posteriors)
     # χ² four standard deviations above its mean: no mode explains the star.
     return modes, find_unexplained(modes, posteriors, 4.0)
 
@@ -178,11 +184,9 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
     posteriors : StarPosteriors
         Photon counts and likelihood of the stars, and the model of their stamps.
     """
-    # At the mode, the covariance of z is the inverse of information + 1, with 1 for the prior. With
-    # its Cholesky factor L, ½ ln det(covariance) = Σ ln L_kk.
     peaks = _climb_along(modes, posteriors, np.empty((0, len(MONOMIALS))))
-    factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
-    evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    covariance, evidence = peaks.laplace()
+    factor = np.linalg.cholesky(covariance)
     return separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
 
 
@@ -217,7 +221,7 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
     """
     likelihood, model = posteriors.likelihood, posteriors.model
 
-    def evaluate(rows: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(rows: np.ndarray, z: np.ndarray) -> Evaluation:
         # Stamps and their derivatives by z and along the added directions.
         field, terms = modes.field[rows], modes.z.shape[1]
         coefficients = model.coefficients(z[:, :terms], field) + z[:, terms:] @ added_directions
@@ -225,14 +229,10 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
             [model.directions(field), np.tile(added_directions, (rows.size, 1, 1))], axis=1
         )
         stamps, slopes = model.derivatives(coefficients, directions, modes.offset[rows])
-        # Poisson likelihood times the prior N(0, 1): their logarithms and derivatives add up.
-        # ln posterior = −½ (deviance + |z|²), slope = score − z, information + 1.
+        # Poisson likelihood times the prior N(0, 1).
         counts, mean_counts = posteriors.counts[modes.star[rows]], likelihood.predict_counts(stamps)
-        deviance, score, information = poisson_information(
-            counts, mean_counts, likelihood.flux * slopes
-        )
-        height = -0.5 * (deviance + (z**2).sum(axis=1))
-        return height, score - z, information + np.eye(z.shape[1])
+        by_counts = poisson_information(counts, mean_counts, likelihood.flux * slopes)
+        return add_normal_prior(by_counts, z, np.ones(z.shape[1]))
 
     start = np.hstack([modes.z, np.zeros((len(modes.z), len(added_directions)))])
     steps = Steps(max_drop=modes.max_drop)
@@ -242,8 +242,8 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
 def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> np.ndarray:
     """List the stars whose best mode does not explain their image, without or with their field.
 
-    For the right mode and P pixels, χ² = Σ (n − μ)²/μ has the mean P and the variance 2P. A star is
-    unexplained if its χ² is larger by more than `misfit_sigma` standard deviations.
+    A star is unexplained if χ² = Σ (n − μ)²/μ is more than `misfit_sigma` standard deviations above
+    its mean for the right mode (`compute_deviance_limit`).
 
     Parameters
     ----------
@@ -264,8 +264,7 @@ def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: flo
     # χ² of the photons about the counts that the mode predicts.
     mean_counts = posteriors.likelihood.predict_counts(stamps.reshape(len(stamps), -1))
     chi2 = ((posteriors.counts[modes.star] - mean_counts) ** 2 / mean_counts).sum(axis=1)
-    pixels = mean_counts.shape[1]
-    return np.unique(modes.star[chi2 > pixels + misfit_sigma * np.sqrt(2.0 * pixels)])
+    return np.unique(modes.star[chi2 > compute_deviance_limit(mean_counts.shape[1], misfit_sigma)])
 
 
 def place_corners(modes: Modes, stars: np.ndarray) -> Modes:
@@ -279,7 +278,7 @@ def place_corners(modes: Modes, stars: np.ndarray) -> Modes:
     stuck = np.flatnonzero(np.isin(modes.star, stars))
     # Every stuck mode with every combination of signs.
     signs = np.array(list(product((-1.0, 1.0), repeat=modes.z.shape[1])))
-    start = modes.take(np.repeat(stuck, len(signs)))
+    start = modes.select(np.repeat(stuck, len(signs)))
     z = start.z + 0.5 * np.tile(signs, (stuck.size, 1))
     return Modes.make_starts(start.star, start.field, start.offset, start.knowledge, z)
 
@@ -309,8 +308,8 @@ def find_twins(modes: Modes, posteriors: StarPosteriors) -> Modes:
     likelihood, model = posteriors.likelihood, posteriors.model
     # The three best modes of every star, their monomial coefficients m, and the Fisher
     # information F² ∂p ∂pᵀ / (F p + B) of the eight.
-    blind = modes.take(np.flatnonzero(modes.knowledge == Knowledge.NONE))
-    source = blind.take(select_largest(blind.star, blind.evidence, 3))
+    blind = modes.select(modes.knowledge == Knowledge.NONE)
+    source = blind.select(select_largest(blind.star, blind.evidence, 3))
     coefficients = model.coefficients(source.z, source.field)
     axes = np.tile(np.eye(len(MONOMIALS)), (len(coefficients), 1, 1))
     stamps, jacobian = model.derivatives(coefficients, axes, source.offset)

@@ -12,7 +12,9 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from psfdae.base.rows import Rows
 from psfdae.sensing.climbing import group_maximum
+from psfdae.sensing.modes import merge_modes
 from psfdae_paper.bounds.mixture import Mixture
 
 
@@ -33,7 +35,7 @@ class Positions(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Modes:
+class Modes(Rows):
     """The M modes of stars' posteriors, or starting points (f, o, z) of a search for modes.
 
     Attributes
@@ -79,16 +81,6 @@ class Modes:
         scales = np.tile(np.eye(z.shape[1]), (len(z), 1, 1))
         return cls(star, field, offset, knowledge, z, scales, np.zeros(len(z)))
 
-    def take(self, modes: np.ndarray) -> Modes:
-        """Return the modes with these numbers, in the order given."""
-        return Modes(*(values[modes] for values in vars(self).values()))
-
-    def __add__(self, addend: Modes) -> Modes:
-        """Return these modes, then the added ones."""
-        # All attributes are arrays with a row for every mode.
-        pairs = zip(vars(self).values(), vars(addend).values(), strict=True)
-        return Modes(*(np.concatenate(pair) for pair in pairs))
-
     @property
     def group(self) -> np.ndarray:
         """Group number of each mode by star and knowledge, (M,)."""
@@ -97,7 +89,7 @@ class Modes:
     @property
     def best_of_group(self) -> Modes:
         """Best mode of every star, without and with its field known."""
-        return self.take(select_largest(self.group, self.evidence, 1))
+        return self.select(select_largest(self.group, self.evidence, 1))
 
     @property
     def mixture(self) -> Mixture:
@@ -179,19 +171,12 @@ def separate(modes: Modes) -> Modes:
     """
     # Best log-mass of each star, by the knowledge that led to it.
     best_evidence = group_maximum(modes.evidence, modes.group)
-    noticeable = np.flatnonzero(modes.evidence > best_evidence - modes.max_drop)
-    distinct: dict[tuple[int, ...], list[int]] = {}
+    modes = modes.select(modes.evidence > best_evidence - modes.max_drop)
+    # Only modes of a star in the same field and at the same offset can be the same.
+    cell = np.column_stack([modes.star, modes.field, modes.offset])
+    cell_number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    covariance = modes.factor @ modes.factor.swapaxes(1, 2)
+    maximum = merge_modes(modes.z, covariance, modes.evidence, cell_number)
     knowledge = modes.knowledge.copy()
-    # In descending order of evidence, so that each mode is compared with better ones.
-    for m in noticeable[np.argsort(-modes.evidence[noticeable], kind="stable")]:
-        neighbours = distinct.setdefault((modes.star[m], modes.field[m], *modes.offset[m]), [])
-        for k in neighbours:
-            # Mahalanobis distance in the covariance L Lᵀ of the better mode.
-            distance = np.linalg.solve(modes.factor[k], modes.z[m] - modes.z[k])
-            if distance @ distance < 1.0:
-                knowledge[k] = min(knowledge[k], knowledge[m])
-                break
-        else:
-            neighbours.append(int(m))
-    numbers = np.sort(np.concatenate(list(distinct.values())))
-    return replace(modes, knowledge=knowledge).take(numbers)
+    np.minimum.at(knowledge, maximum, modes.knowledge)
+    return replace(modes, knowledge=knowledge).select(np.unique(maximum))

@@ -17,6 +17,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from psfdae.base.progress import steps
+from psfdae.base.rows import Rows
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
@@ -235,7 +236,7 @@ class ScoredStars:
 
 
 @dataclass
-class PosteriorSums:
+class PosteriorSums(Rows):
     """Weighted sums over samples of the posterior of n test stars.
 
     Attributes
@@ -263,15 +264,6 @@ class PosteriorSums:
         shapes = ((), (), (pixels,), (pixels,), (fields, shifts))
         zeros = (np.zeros((stars, *shape)) for shape in shapes)
         return cls(np.full(stars, -np.inf), *zeros)
-
-    @classmethod
-    def stack(cls, parts: Sequence[PosteriorSums]) -> PosteriorSums:
-        """Join the sums of groups of test stars, one after the other."""
-        return cls(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
-
-    def take(self, stars: np.ndarray) -> PosteriorSums:
-        """Return the sums of the stars with these numbers, in the order given."""
-        return PosteriorSums(*(values[stars] for values in vars(self).values()))
 
     def put(self, stars: np.ndarray, replacement: PosteriorSums) -> None:
         """Replace the sums of the stars with these numbers."""
@@ -339,7 +331,7 @@ class PosteriorSums:
             return
         # The sums of stars with a new best image are rescaled to it.
         star_numbers = np.flatnonzero(log_scale != self.log_scale)
-        self.put(star_numbers, self.take(star_numbers).rescale(log_scale[star_numbers]))
+        self.put(star_numbers, self.select(star_numbers).rescale(log_scale[star_numbers]))
         # A star without any possible image so far keeps weights of zero.
         log_weight = part.scores[:, columns] - np.maximum(log_scale, np.finfo(float).min)[:, None]
         weight = np.exp(log_weight.astype(np.float32))

@@ -102,7 +102,7 @@ def sample_posterior(
         # A sampler has the modes of its star alone, and the star's own random numbers.
         samplers = [
             _Sampler(
-                modes.take(np.flatnonzero(modes.star == star)),
+                modes.select(modes.star == star),
                 int(star_field[star]),
                 posteriors.counts[star],
                 rngs[star],
@@ -115,7 +115,7 @@ def sample_posterior(
 
     # First around the modes that the search finds. Stars with a mode that is reached only from the
     # truth are sampled again with all modes; their generators continue.
-    detected_modes = modes.take(np.flatnonzero(modes.knowledge != Knowledge.TRUTH))
+    detected_modes = modes.select(modes.knowledge != Knowledge.TRUTH)
     incomplete_stars = np.unique(modes.star[modes.knowledge == Knowledge.TRUTH])
     rows: list[tuple[PosteriorSums, ...]] = []
     for stars in np.array_split(np.arange(len(rngs)), -(-len(rngs) // stars_at_once)):
@@ -128,7 +128,7 @@ def sample_posterior(
             totals = with_truth.get(star, sampler).totals(posteriors.model)
             rows.append((*sampler.parts(posteriors.model), *totals))
     *parts, total, total_in_field = (
-        PosteriorSums.stack(column) for column in zip(*rows, strict=True)
+        PosteriorSums.join(column) for column in zip(*rows, strict=True)
     )
     unknown_field = SampledPosterior(parts[:4], total)
     return unknown_field, SampledPosterior(parts[4:], total_in_field)

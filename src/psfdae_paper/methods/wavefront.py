@@ -286,5 +286,5 @@ class Wavefront(Method):
             promising = (size < ENOUGH_ESS) & (8 * size >= ENOUGH_ESS)
             if promising.any():
                 further_sums = weigh(stars[promising], bank_stars[eighth:])
-                sums.put(stars[promising], merge([first_sums.take(promising), further_sums]))
+                sums.put(stars[promising], merge([first_sums.select(promising), further_sums]))
         return sums

@@ -82,7 +82,7 @@ def modes(model, stars, noise):
     likelihood = Likelihood.from_noise(noise, LEVEL, stars[1])
     posteriors = StarPosteriors(stars[2], likelihood, model)
     first = climb(start, posteriors)
-    return climb(first + find_twins(first, posteriors), posteriors)
+    return climb(Modes.join([first, find_twins(first, posteriors)]), posteriors)
 
 
 def sampled(model, modes, stars, noise, draws=2000, **blocks):
@@ -214,7 +214,7 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
 
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
     misplaced, truth, posteriors = aside(stars, model, noise, 1e-3, (0, 1))
-    with_truth = misplaced + climb(truth, posteriors)
+    with_truth = Modes.join([misplaced, climb(truth, posteriors)])
     first, second = (
         sample_posterior(modes, posteriors, np.zeros(1, int), 100, [stream(1, "test", 0)])[1]
         for modes in (misplaced, with_truth)

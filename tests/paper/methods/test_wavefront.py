@@ -122,10 +122,8 @@ def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, nam
     modes, missed = fitted[name].modes(noisy, LEVEL, data.positions[-TEST:])
     assert missed.size == 0
     truth = fitted[name].model.standardise(columns["seidel"][-TEST:])
-    modes_of_field = modes.take(
-        np.flatnonzero(modes.field == columns["field_index"][-TEST:][modes.star])
-    )
-    first = modes_of_field.take(select_largest(modes_of_field.star, modes_of_field.evidence, 1))
+    modes_of_field = modes.select(modes.field == columns["field_index"][-TEST:][modes.star])
+    first = modes_of_field.select(select_largest(modes_of_field.star, modes_of_field.evidence, 1))
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0
