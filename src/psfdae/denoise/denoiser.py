@@ -74,7 +74,7 @@ class CentredStars(NamedTuple):
     border_level: np.ndarray
     photometry: Photometry
 
-    def measurable(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def repair_stamps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return stamps above the level of their border, repaired, with their noise.
 
         Returns
@@ -99,9 +99,9 @@ class CentredStars(NamedTuple):
             is_unmeasured[:, None, None], np.where(bad, level, stamps), filled_stamps
         )
         data = np.where(photometry.is_used & ~bad, stamps, filled_stamps).astype(np.float64) - level
-        # Stamps need as many good pixels as the photometry asks for, and some contrast.
+        # Stamps need as many usable pixels as the photometry asks for, and some contrast.
         largest = np.abs(data).max(axis=(1, 2))
-        has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_good_pixels
+        has_pixels = bad.mean(axis=(1, 2)) <= 1 - FluxModel.min_pixel_fraction
         is_unusable = ~(has_pixels & (largest > 0) & np.isfinite(largest))
         is_unusable |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(photometry.noise)
         data = np.where(is_unusable[:, None, None], 0.0, data)
@@ -290,7 +290,7 @@ class Denoiser(ABC):
         # PSFs of flux 1 times the flux, and r = x − b − F psf.
         flux = photometry.flux.astype(np.float32)[:, None, None]
         # F psf ± F w, with the half-width w of the case of each star.
-        half_width, ratio95, flux_scale = errors.half_width(psf, sigma, noise, stars)
+        half_width, ratio95, flux_scale = errors.compute_half_widths(psf, sigma, noise, stars)
         psf *= flux
         residual = (centred_stars.stamps - photometry.background[:, None, None]).astype(
             np.float32
@@ -345,11 +345,15 @@ class Denoiser(ABC):
         `flux_scale` (n,) is the factor of the errors by noise.
         """
 
-    @abstractmethod
     def _total_fluxes(
         self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
     ) -> dict[str, Any]:
-        """Return fluxes with the light outside the stamps, and skies without that in the stamps."""
+        """Return fluxes with the light outside the stamps, and skies without that in the stamps.
+
+        By default, this light is not known.
+        """
+        unknown, sky = np.full(len(photometry.flux), np.nan), photometry.background
+        return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
 
 
 class StampDenoiser(Denoiser):
@@ -431,13 +435,6 @@ class StampDenoiser(Denoiser):
         scale = flux_scale * stars.noise_correlation
         return np.asarray(np.sqrt((scale * photometry.flux_error) ** 2 + photons))
 
-    def _total_fluxes(
-        self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
-    ) -> dict[str, Any]:
-        unknown = np.full(len(photometry.flux), np.nan)
-        sky = photometry.background
-        return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
-
 
 class FieldDenoiser(Denoiser):
     """Denoiser with a method that knows the PSF at every position, and measures stars itself.
@@ -460,13 +457,11 @@ class FieldDenoiser(Denoiser):
         self, stars: Stamps, photometry: Photometry, flux_error: np.ndarray
     ) -> dict[str, Any]:
         """Return fluxes with the light beyond the stamps, and skies without that in the stamps."""
-        flux, sky = photometry.flux, photometry.background
         if self.wings is None:
-            unknown = np.full(len(flux), np.nan)
-            return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
-        position = np.stack([stars.x, stars.y], axis=1)
+            return super()._total_fluxes(stars, photometry, flux_error)
+        flux, sky = photometry.flux, photometry.background
         # A PSF with more light in the outer part of its stamp has more light beyond it.
-        outer_share = outer_shares(self.method.psf_at, position, flux)
+        outer_share = outer_shares(self.method.psf_at, stack_coordinates(stars, flux))
         factor, factor_error = self.wings.total_over_flux(outer_share)
         # The error of a flux that was given is not known: it is NaN.
         total_error = np.hypot(flux_error * factor, flux * factor_error)
@@ -474,6 +469,15 @@ class FieldDenoiser(Denoiser):
         even_light = np.maximum(flux, 0.0) * self.wings.scale(outer_share) * self.wings.profile[0]
         sky = np.where(np.isnan(stars.background), sky - np.nan_to_num(even_light), sky)
         return {"flux_total": flux * factor, "flux_total_error": total_error, "background": sky}
+
+
+def stack_coordinates(stars: Stamps, flux: np.ndarray) -> np.ndarray:
+    """Return x, y, magnitude and colour, on which the PSF of a star depends, (n, 4).
+
+    A star without a listed magnitude has the magnitude of its flux (n,), in counts.
+    """
+    star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
+    return np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
 
 
 def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorModel) -> DenoisedStars:
@@ -496,13 +500,10 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
         centred_stars.border_level,
     )
     # Stamps above the level of their border; the measured sky is relative to it, too.
-    data, noise, is_unusable = centred_stars.measurable()
+    data, noise, is_unusable = centred_stars.repair_stamps()
     flux_is_given = np.isfinite(stars.flux)
-    # Position, magnitude and colour, on which the PSF depends; a star without a listed magnitude
-    # has the magnitude of its flux.
     flux = np.where(flux_is_given, stars.flux, photometry.flux)
-    star_magnitude = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
-    position = np.stack([stars.x, stars.y, star_magnitude, stars.colour], axis=1)
+    position = stack_coordinates(stars, flux)
     # PSF, flux, sky and centre at once; given values are taken unchanged. Centres count from the
     # middle of the stamp, which was moved.
     estimate = method.measure(
@@ -518,7 +519,9 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     # Errors of the method, by noise, and errors of the PSF model add up: C = C_noise + C_model.
     star_fit = estimate.measurements
     assert star_fit is not None and estimate.sigma is not None
-    covariance = errors.model.add_to_covariance(star_fit.covariance, star_fit.flux, position[:, :2])
+    covariance = errors.model_errors.add_to_covariance(
+        star_fit.covariance, star_fit.flux, position[:, :2]
+    )
     flux_error = np.sqrt(covariance[:, 0, 0])
     # A given flux is used unless the photometry refused it, a measured one if it is above its
     # error.

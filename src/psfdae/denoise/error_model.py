@@ -54,11 +54,11 @@ class ModelErrors(NamedTuple):
         Error of the flux over the flux, RMS over the field, where the PSF is fitted on a sky that
         is known from the whole image.
     middle : ndarray, shape (2,)
-        Place (x₀, y₀) in the image from which the variance of a flux grows.
+        Position (x₀, y₀) in the image from which the variance of a flux grows.
     growth : ndarray, shape (4,)
         Coefficients (a, b, c, d): the variance of a flux at the position (x, y) is v = a + b u² +
         c w² + d u² w² times its mean over the field, with u = x − x₀ and w = y − y₀ in pixels. By
-        default it is the same at all places. Errors of sky and centre grow alike.
+        default it is the same everywhere. Errors of sky and centre grow alike.
     """
 
     flux: float = 0.0
@@ -90,7 +90,7 @@ class ModelErrors(NamedTuple):
         flux : ndarray, shape (n,)
             Fluxes of the stars; negative ones count as 0.
         position : ndarray, shape (n, 2)
-            Place x and y in the image; NaN where unknown.
+            Position (x, y) in the image; NaN where unknown.
 
         Returns
         -------
@@ -135,7 +135,7 @@ class ErrorModel:
     noise_floor : float
         Noise over the flux that is added in quadrature to the noise of a star while its flux is
         found, but not while it is denoised: errors of the PSF's shape would bias the flux.
-    model : ModelErrors
+    model_errors : ModelErrors
         Errors of stars that the method measures itself, due to the PSF model.
     """
 
@@ -148,7 +148,7 @@ class ErrorModel:
     distance_limit: float
     outlier_limit: np.ndarray | None = None
     noise_floor: float = 0.0
-    model: ModelErrors = field(default_factory=ModelErrors)
+    model_errors: ModelErrors = field(default_factory=ModelErrors)
 
     @classmethod
     def build_uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
@@ -180,23 +180,21 @@ class ErrorModel:
         values: dict[str, Any] = dict(arrays)
         values |= {name: float(arrays[name]) for name in ("distance_limit", "noise_floor")}
         # Ten numbers of the model's own errors; the last six are middle and growth of the flux's.
-        table = arrays["model"]
-        flux, sky, centre, fitted_flux = table[:4].tolist()
-        model = ModelErrors(flux, sky, centre, fitted_flux, table[4:6], table[6:])
-        return cls(**values | {"model": model})
+        table = values.pop("model")
+        return cls(**values, model_errors=ModelErrors(*table[:4].tolist(), table[4:6], table[6:]))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""
         # The reverse of `from_arrays`.
         values = {table.name: getattr(self, table.name) for table in fields(self)}
-        values["model"] = np.hstack(self.model)
+        values["model"] = np.hstack(values.pop("model_errors"))
         return {
             name: np.asarray(value, np.float32 if name == "half_width68" else np.float64)
             for name, value in values.items()
             if value is not None
         }
 
-    def half_width(
+    def compute_half_widths(
         self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the widths of the errors of PSFs of flux 1, and of their fluxes.
@@ -237,11 +235,8 @@ class ErrorModel:
 
         def interpolate_case(table: np.ndarray) -> np.ndarray:
             """Interpolate a table of all cases (S, 2, 3, 2) at the noise and case of each star."""
-            # Linear in the noise, each of the 12 numbers of a node by itself.
-            columns = table.reshape(len(table), -1).T
-            values = np.stack([np.interp(noise, self.noise, column) for column in columns], axis=1)
-            of_case = values.reshape(-1, *table.shape[1:])
-            return np.asarray(of_case[np.arange(len(noise)), estimates_noise.astype(int), case])
+            values = interpolate_at_noise(noise, self.noise, table)
+            return np.asarray(values[np.arange(len(noise)), estimates_noise.astype(int), case])
 
         # A pixel has the factor of its brightness; ratios of 95 % follow from both factors.
         scale68, scale95 = interpolate_case(self.scale68), interpolate_case(self.scale95)
@@ -264,7 +259,7 @@ class ErrorModel:
 
 
 def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """Interpolate maps of errors linearly at the noise of each star.
+    """Interpolate maps or tables of errors linearly at the noise of each star.
 
     They are linear in the noise and not in its logarithm: an error is a floor plus a part that
     grows about as fast as the noise. Outside the nodes the nearest one counts.
@@ -275,12 +270,12 @@ def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray)
         RMS of the sky noise in a pixel over the flux, such as `BundleInfo.noise_min`.
     nodes : ndarray, shape (S,)
         Noise at which the maps were measured, ascending.
-    maps : ndarray, shape (S, d, d)
-        Error of each pixel at the nodes, in any unit.
+    maps : ndarray, shape (S, ...)
+        Error of each pixel at the nodes, or other numbers, in any unit.
 
     Returns
     -------
-    ndarray, shape (n, d, d)
+    ndarray, shape (n, ...)
         Maps in their own unit; NaN where the noise is NaN.
     """
     noise = np.asarray(noise, dtype=np.float64)
@@ -288,7 +283,7 @@ def interpolate_at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray)
     position = np.interp(noise, nodes, np.arange(len(nodes), dtype=np.float64))
     lower = np.where(np.isfinite(position), np.minimum(position, len(nodes) - 1), 0).astype(np.intp)
     upper = np.minimum(lower + 1, len(nodes) - 1)
-    fraction = (position - lower).astype(maps.dtype)[:, None, None]
+    fraction = (position - lower).astype(maps.dtype).reshape(-1, *[1] * (maps.ndim - 1))
     # (1 − f) · lower map + f · upper map; a noise that is NaN has a fraction that is NaN.
     return np.asarray(maps[lower] * (1 - fraction) + maps[upper] * fraction)
 

@@ -50,13 +50,13 @@ class FluxModel:
         Least and greatest value of every pixel in the set.
     other_variance : float
         Variance along all directions that `basis` leaves out.
-    min_good_pixels : float
+    min_pixel_fraction : float
         Fraction of the pixels of a stamp that a fit needs.
     clip_sigma : float
-        σ of the noise by which good pixels may leave the range of the training set.
+        σ of the noise by which pixels of a star may leave the range of the training set.
     """
 
-    min_good_pixels: ClassVar[float] = 0.5
+    min_pixel_fraction: ClassVar[float] = 0.5
     clip_sigma: ClassVar[float] = 5.0
 
     mean: np.ndarray
@@ -73,7 +73,7 @@ class FluxModel:
 
     @property
     def pixel_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest value (P,) of a good pixel of a star of flux 1 without noise.
+        """Least and greatest value (P,) of a pixel of a star of flux 1 without noise.
 
         The range of the training set is widened by half for PSFs that the set does not hold, and by
         1 % of the brightest pixel.
@@ -221,7 +221,7 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> Photometry:
     flat = np.where(finite, flat, 0.0)
     maximum = flat.max(axis=1, where=finite, initial=-np.inf)
     minimum = flat.min(axis=1, where=finite, initial=np.inf)
-    possible = (finite.mean(axis=1) >= model.min_good_pixels) & (maximum > minimum)
+    possible = (finite.mean(axis=1) >= model.min_pixel_fraction) & (maximum > minimum)
     # A stand-in for hopeless stars: linear algebra on fewer rows would round the others anew.
     x = np.where(possible[:, None], flat, model.mean)
     usable_pixel = finite | ~possible[:, None]
@@ -234,7 +234,7 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> Photometry:
         scaled_pixels = np.clip(x / unit[:, None], -1e15, 1e15)
     flux, error, sigma, is_used, repaired_pixels = _robust_fit(scaled_pixels, usable_pixel, model)
     # Flags: NO_FLUX if too few pixels are left, or the flux is below its error.
-    is_fitted = possible & (is_used.mean(axis=1) >= model.min_good_pixels)
+    is_fitted = possible & (is_used.mean(axis=1) >= model.min_pixel_fraction)
     usable = is_fitted & (flux > error)
     flags = np.zeros(len(images), np.uint16)
     raise_flag(flags, StarFlag.MASKED, ~finite.all(axis=1))
@@ -295,7 +295,8 @@ def _robust_fit(
         noise = model.clip_sigma * sigma[:, None]
         is_used = finite & (x <= positive * high + noise) & (x >= positive * low - noise)
         # A star without enough pixels is given up; its numbers only have to be defined.
-        in_fit = np.where((is_used.mean(axis=1) >= model.min_good_pixels)[:, None], is_used, finite)
+        has_pixels = is_used.mean(axis=1, keepdims=True) >= model.min_pixel_fraction
+        in_fit = np.where(has_pixels, is_used, finite)
         # F² in S, from the last round, and never below the variance of F by the noise alone.
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
         flux, error, score, repaired_pixels = solve_least_squares(x, in_fit, prior, sigma, model)

@@ -260,7 +260,7 @@ class StarModel(FieldPsfs):
         middle of the field, they are not below the RMS over the whole field: a map of the sky has
         errors there as well, which no field knows.
         """
-        errors = self.bundle.errors.model
+        errors = self.bundle.errors.model_errors
         return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(position), 1.0))
 
     @property
@@ -334,9 +334,9 @@ class StarModel(FieldPsfs):
         bundle, weights = self.bundle, dict(self.bundle.weights)
         for name in ("low", "high"):
             weights[name] = weights[name] - np.pad(offset, (0, len(weights[name]) - 2))
-        model_errors = bundle.errors.model
+        model_errors = bundle.errors.model_errors
         moved_errors = model_errors._replace(middle=model_errors.middle - offset)
-        errors = replace(bundle.errors, model=moved_errors)
+        errors = replace(bundle.errors, model_errors=moved_errors)
         shifted_bundle = replace(bundle, weights=weights, errors=errors)
         # Results name the file of the model.
         vars(shifted_bundle)["sha256"] = bundle.sha256

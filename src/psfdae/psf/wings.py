@@ -177,19 +177,32 @@ def choose_wings(wings: Wings | None, trained_wings: Wings | None) -> Wings | No
 
 
 def outer_shares(
-    draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray, flux: np.ndarray | None = None
+    draw: Callable[[np.ndarray], np.ndarray], position: np.ndarray, flux: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the fraction of a star's flux in the outer part of its stamp, (n,), at places (n, 2).
+    """Return the fraction of the flux of n stars in the outer part of their stamps.
 
-    The outer part is between 0.7 times half the side of the stamp and half the side. `draw` makes
-    PSFs (m, d, d) of m stars by their x, y and, if fluxes (n,) in counts are given, magnitude. The
-    result is NaN where a place, x and y in px, or a flux is not known.
+    The outer part is between 0.7 times half the side of the stamp and half the side.
+
+    Parameters
+    ----------
+    draw : callable
+        Function that returns PSFs (m, d, d) of m stars at the columns of their position.
+    position : ndarray, shape (n, 2) to (n, 4)
+        x and y in px, magnitude and colour, on which the PSF depends.
+    flux : ndarray, shape (n,), optional
+        Fluxes in counts, for a magnitude as third column.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        NaN where x, y or the magnitude is not known.
     """
-    shares = np.full(len(place), np.nan)
-    position = np.rint(place)  # at whole pixels, so that phases do not change the share
+    shares = np.full(len(position), np.nan)
+    # At whole pixels, so that phases do not change the share.
+    position = np.column_stack([np.rint(position[:, :2]), position[:, 2:]])
     if flux is not None:
         position = np.column_stack([position, magnitude(flux)])
-    rows_with_position = np.flatnonzero(np.isfinite(position).all(axis=1))
+    rows_with_position = np.flatnonzero(np.isfinite(position[:, :3]).all(axis=1))
     # Some at a time, so that their PSFs take little memory.
     for first in range(0, len(rows_with_position), 2048):
         part = rows_with_position[first : first + 2048]

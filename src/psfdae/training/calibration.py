@@ -27,7 +27,7 @@ from psfdae.denoise.error_model import (
 from psfdae.denoise.flux_model import FluxModel
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.stamps import StarFlag
-from psfdae.methods.interface import Method
+from psfdae.methods.interface import FitError, Method
 from psfdae.training.star_sets import HeldOutStars, ModelStars
 
 NODES = 8
@@ -111,7 +111,7 @@ class StarErrors:
         )
 
     @cached_property
-    def half_width(self) -> np.ndarray:
+    def half_width68(self) -> np.ndarray:
         """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d).
 
         At least a quarter of the root mean square: after the stars' own noise is subtracted, most
@@ -126,7 +126,7 @@ class StarErrors:
         """Return the ratio of the half-widths that hold 95 and 68 % of all pixels, shape (S,)."""
         # One ratio for all pixels of a node: in units of their half-widths, errors of all pixels
         # are taken to have the same distribution.
-        scaled_error = self.error / np.maximum(self.half_width, 1e-12)[:, None]
+        scaled_error = self.error / np.maximum(self.half_width68, 1e-12)[:, None]
         return np.array([np.quantile(node, 0.95) for node in scaled_error], np.float64)
 
     def outlier_limit(self) -> np.ndarray | None:
@@ -261,6 +261,11 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     noisy = images + noise * rng.normal(size=images.shape)
     prediction = model.predict(noisy, position=position)
     usable = (prediction.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
+    if not usable.any():
+        raise FitError(
+            f"none of {len(usable)} stars drawn from the fitted field can be measured: it has no "
+            "usable PSF; more training stars, or a lower order of the field, may help"
+        )
     # Drawn centres count from the middle of the stamp, fitted ones from its corner.
     centre = centre + images.shape[-1] // 2
 
@@ -290,7 +295,7 @@ def fit_model_errors(model: StarModel, method_fit: Method, seed: int) -> ErrorMo
     model_errors = ModelErrors(
         max(flux, fitted_flux), sky, centre_error, fitted_flux, *growth_over_field
     )
-    return replace(errors, model=model_errors)
+    return replace(errors, model_errors=model_errors)
 
 
 def fit_half_widths(
@@ -307,7 +312,7 @@ def fit_half_widths(
     )
     errors = replace(
         errors,
-        half_width68=star_errors.half_width,
+        half_width68=star_errors.half_width68,
         ratio95=star_errors.ratio95(),
         distance_limit=star_errors.distance_limit(),
         outlier_limit=star_errors.outlier_limit(),
@@ -450,7 +455,7 @@ def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float],
     halves = []
     for half in (is_even, ~is_even) if count > 1 else ():
         other_half = errors.select(~half)
-        width = other_half.half_width
+        width = other_half.half_width68
         width95 = (width * other_half.ratio95()[:, None, None]).astype(width.dtype)
         halves.append((half, {"coverage68": width, "coverage95": width95}))
 

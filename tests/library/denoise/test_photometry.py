@@ -11,12 +11,14 @@ from scipy import ndimage
 
 from prediction_stars import observe
 from psfdae.denoise import flux_model as module
+from psfdae.denoise.denoiser import FieldDenoiser
 from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.flux_model import FluxModel, robust_flux
 from psfdae.denoise.leading_modes import LeadingModes, compute_clipped_rms
 from psfdae.denoise.star_flux import Photometer
 from psfdae.image.sky import border_pixels
 from psfdae.image.stamps import StarFlag, cut, displacement, smooth_stamps
+from psfdae.psf.wings import Wings
 from psfdae.stars.moments import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
@@ -284,8 +286,34 @@ def test_intervals_of_95_percent_contain_those_of_68_percent():
     errors = replace(ErrorModel.build_uncalibrated(noise, unit), ratio95=np.array([0.5, 2.0]))
     given = SimpleNamespace(noise=np.ones(3), flux=np.ones(3), background=np.zeros(3))
     psf = np.full((3, 8, 8), 1 / 64)
-    _, ratio95, _ = errors.half_width(psf, None, np.array([0.01, 0.07, 0.1]), given)
+    _, ratio95, _ = errors.compute_half_widths(psf, None, np.array([0.01, 0.07, 0.1]), given)
     assert ratio95[:, 0] == pytest.approx([1.0, 1.5, 2.0])
+
+
+def test_light_outside_stamps_is_by_the_psf_at_listed_magnitude_and_colour():
+    """The outer light of this PSF is 0.01 times magnitude and colour, or the magnitude by flux."""
+
+    def psf_at(position):
+        share = 0.01 * np.nan_to_num(position[:, 2:]).sum(axis=1)
+        psf = np.zeros((len(position), 8, 8))
+        psf[:, 4, 4], psf[:, 4, 7] = 1.0 - share, share
+        return psf
+
+    wings = Wings(np.array([4.0, 8.0, 16.0]), np.array([0.0, 1e-3, 1e-4]), np.eye(3), 0.03)
+    denoiser = object.__new__(FieldDenoiser)
+    denoiser.method, denoiser.wings = SimpleNamespace(psf_at=psf_at), wings
+    count, flux = 4, np.full(4, 10**-1.2)  # of magnitude 3
+    stars = SimpleNamespace(
+        x=np.full(count, 50.0),
+        y=np.full(count, 60.0),
+        magnitude=np.array([np.nan, 1.0, 1.0, np.nan]),
+        colour=np.array([np.nan, np.nan, 0.5, 0.5]),
+        background=np.zeros(count),
+    )
+    photometry = SimpleNamespace(flux=flux, background=np.zeros(count))
+    total = denoiser._total_fluxes(stars, photometry, np.zeros(count))["flux_total"]
+    expected = wings.total_over_flux(np.array([0.03, 0.01, 0.015, 0.035]))[0]
+    assert total / flux == pytest.approx(expected, rel=1e-9)
 
 
 def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -12,6 +14,7 @@ from command_line import printed
 from psfdae.denoise.error_model import ModelErrors
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
+from psfdae.image.stamps import StarFlag
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.errors import excess_scatter
 from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
@@ -78,6 +81,23 @@ def within(off, error):
     return np.mean(np.abs(off) < error), np.mean(np.abs(off) < 1.96 * error)
 
 
+@pytest.mark.parametrize("flag", [StarFlag.NO_FLUX, StarFlag.OUTLIER])
+def test_a_field_whose_stars_cannot_be_measured_is_an_error_of_one_line(flag):
+    """Quantiles of no star do not exist."""
+
+    def draw_stars(count, rng):
+        return np.zeros((count, 16, 16)), np.zeros((count, 2)), np.zeros((count, 2))
+
+    def predict(stamps, position):
+        return SimpleNamespace(flags=np.full(len(stamps), int(flag)))
+
+    info, bundle = SimpleNamespace(noise_equivalent_px=10.0), SimpleNamespace(errors=None)
+    model = SimpleNamespace(info=info, bundle=bundle, predict=predict)
+    field = SimpleNamespace(knows_field=True, draw_stars=draw_stars)
+    with pytest.raises(psfdae.Error, match="stars drawn from the fitted field"):
+        fit_model_errors(model, field, 1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("snr", [(5, 20), (20, 50), (50, 200), (200, 1000), (1000, 2000)])
 def test_errors_hold_at_every_signal_to_noise(models, snr):
@@ -118,7 +138,7 @@ def test_no_errors_of_the_model_where_numbers_are_known(models):
     prediction = models[0].predict(stamps, fixed=True, **stated)
     assert (prediction.background_error == 0).all()
     assert (prediction.x_error == 0).all()
-    errors = models[0].bundle.errors.model
+    errors = models[0].bundle.errors.model_errors
     assert (prediction.flux_error > 1e5 * errors.flux * errors.flux_factor(place)).all()
 
 

@@ -332,7 +332,7 @@ def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_two_thirds_
         stars.errors(psf[first_stars], first_stars)[None],
         np.ones((1, first_stars.size)),
     )
-    width = StarErrors(np.ones(1), errors, first_stars, distance).half_width
+    width = StarErrors(np.ones(1), errors, first_stars, distance).half_width68
     assert width.min() > 0 and 0.1 * own_sigma < width.mean() < 0.7 * own_sigma
     coverage = covered(stars.errors(psf), np.ones(2000), np.ones(1), width)
     assert coverage == pytest.approx(0.72, abs=0.05)
