@@ -18,6 +18,11 @@ class Rows:
         """Return some of the items, selected by indices, a mask or a slice."""
         return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    def put(self, rows: np.ndarray, replacement: Self) -> None:
+        """Replace the items at these indices; the arrays are changed in place."""
+        for field in fields(self):
+            getattr(self, field.name)[rows] = getattr(replacement, field.name)
+
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
         """Return the items of several objects, one after the other."""

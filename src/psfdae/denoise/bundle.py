@@ -393,17 +393,10 @@ def flux_arrays(model: FluxModel, components: int) -> dict[str, np.ndarray]:
         Variances (k,) and `rest`, that along each other direction, in double precision; maps of
         the P pixels, `mean`, `low`, `high` (P,) and `basis` (P, k), in single precision.
     """
-    # Variance along each direction that is not stored: the mean of the eigenvalues left out. Those
-    # of a model from a file are equal; their mean could differ from them in the last digit.
-    trailing = np.array([model.other_variance])
-    if model.is_complete:
-        trailing = model.variance[: model.variance.size - components]
-    is_even = trailing.size and (trailing == trailing[0]).all()
-    trailing_variance = trailing[0] if is_even else trailing.sum() / max(trailing.size, 1)
     # Eigenvalues ascend: the leading ones are the last.
     return {
         "variance": np.asarray(model.variance[-components:], np.float64),
-        "rest": np.asarray(trailing_variance, np.float64),
+        "rest": np.asarray(model.average_variance_beyond(components), np.float64),
         "mean": np.asarray(model.mean, np.float32),
         "low": np.asarray(model.low, np.float32),
         "high": np.asarray(model.high, np.float32),

@@ -52,11 +52,7 @@ class LeadingModes:
         self._peak = float(model.mean @ model.mean)
         # Λ₀, the mean variance along the directions beyond E. One of these is the constant, which
         # the sky takes.
-        self._other_variance = (
-            float(model.variance[: pixels - leading_count].mean())
-            if model.is_complete
-            else model.other_variance
-        )
+        self._other_variance = model.average_variance_beyond(leading_count)
         self._other_count = pixels - 1 - leading_count
         # An unknown sky takes the mean of a stamp: the flux is fitted with the mean PSF without its
         # mean, c = m − 1/P. It has the part Eᵀc along E, and |c|² − |Eᵀc|² beyond.

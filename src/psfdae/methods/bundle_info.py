@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -20,6 +20,17 @@ Kernel = Annotated[int, Field(ge=1, le=31)]
 Width = Annotated[int, Field(ge=1, le=1024)]
 
 
+def check_layers(kernels: Sequence[int], widths: Sequence[int]) -> None:
+    """Raise ValueError for even kernels of a network, or a wrong number of widths between them."""
+    if any(kernel % 2 == 0 for kernel in kernels):
+        raise ValueError(f"kernels = {[*kernels]}: must be odd")
+    if len(widths) != len(kernels) - 1:
+        raise ValueError(
+            f"widths = {[*widths]}: {len(kernels)} kernels need {len(kernels) - 1} widths, not "
+            f"{len(widths)}"
+        )
+
+
 class _Described(BaseModel):
     """Part of the description: immutable, and without unknown keys or infinite numbers."""
 
@@ -35,12 +46,8 @@ class Architecture(_Described):
     widths: Annotated[tuple[Width, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _shape(self) -> Architecture:
-        """Raise ValueError for even kernels, or a wrong number of widths."""
-        if any(kernel % 2 == 0 for kernel in self.kernels):
-            raise ValueError(f"kernels {self.kernels}: must be odd")
-        if len(self.widths) != len(self.kernels) - 1:
-            raise ValueError(f"{len(self.kernels)} kernels, but {len(self.widths)} widths")
+    def _check_layers(self) -> Architecture:
+        check_layers(self.kernels, self.widths)
         return self
 
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.base import progress
+from psfdae.base.rows import Rows
 
 Evaluation = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Logarithm of a posterior or deviance (a,), its slope (a, K), and the information (a, K, K)."""
@@ -43,7 +44,7 @@ class Steps(NamedTuple):
 
 
 @dataclass
-class Peaks:
+class Peaks(Rows):
     """Local maxima that the climbs have reached.
 
     Attributes
@@ -77,11 +78,6 @@ class Peaks:
         covariance = np.linalg.inv(self.information)
         sign, log_determinant = np.linalg.slogdet(covariance)
         return covariance, np.where(sign > 0, self.height + 0.5 * log_determinant, -np.inf)
-
-    def overwrite(self, rows: np.ndarray, peaks: Peaks, peak_rows: np.ndarray) -> None:
-        """Replace the peaks at `rows` by `peak_rows` of `peaks`, except numbers of evaluations."""
-        for name in ("parameters", "height", "slope", "information", "has_converged"):
-            getattr(self, name)[rows] = getattr(peaks, name)[peak_rows]
 
 
 def poisson_information(counts: np.ndarray, mean: np.ndarray, slopes: np.ndarray) -> Evaluation:
@@ -247,7 +243,7 @@ def climb(
         trial = Peaks(parameters, *evaluate(active, parameters), *state)
         tolerance = steps.relative_rounding * np.abs(peaks.height[active])
         is_improved = trial.height >= peaks.height[active] - tolerance
-        peaks.overwrite(active[is_improved], trial, is_improved)
+        peaks.put(active[is_improved], trial.select(is_improved))
         larger_damping = np.maximum(10.0 * damping[active], 0.3)
         damping[active] = np.where(is_improved, damping[active] / 10.0, larger_damping)
     return peaks

@@ -414,48 +414,43 @@ class Wavefronts:
         - `rms` of the wavefront over all modes and `rms_error`, in nanometres;
         - position, flux and sky with errors, as in `measured`.
         """
-        return wavefront_table(self)
+        from astropy.table import Column, Table
 
+        # Rows of the summary and one row for each star without usable pixels, sorted by star.
+        summary, stamps = self.summary, self.stamps
+        star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), self.star))
+        unusable = np.full(star.size - summary["star"].size, np.nan)
+        order = np.argsort(star, kind="stable")
+        star = star[order]
 
-def wavefront_table(wavefronts: Wavefronts) -> Table:
-    """Return the table with a row for every star and mode; see `Wavefronts.table`."""
-    from astropy.table import Column, Table
+        def complete(values: np.ndarray) -> np.ndarray:
+            # Values of the summary, and NaN for stars without usable pixels.
+            return np.append(values, unusable)[order]
 
-    # Rows of the summary and one row for each star without usable pixels, sorted by star.
-    summary, stamps = wavefronts.summary, wavefronts.stamps
-    star = np.append(summary["star"], np.setdiff1d(np.arange(len(stamps)), wavefronts.star))
-    unusable = np.full(star.size - summary["star"].size, np.nan)
-    order = np.argsort(star, kind="stable")
-    star = star[order]
-
-    def complete(values: np.ndarray) -> np.ndarray:
-        # Values of the summary, and NaN for stars without usable pixels.
-        return np.append(values, unusable)[order]
-
-    columns: list[tuple[str, np.ndarray, str | None]] = [
-        ("id", stamps.id[star], None),
-        # Index of the mode: rows since the first row of the star.
-        ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
-        ("probability", complete(summary["probability"]), None),
-        ("explained", wavefronts.explained[star], None),
-        ("chi2", wavefronts.chi2[star], None),
-        ("snr", wavefronts.snr[star], None),
-        ("x_deg", wavefronts.field_deg[star, 0], "deg"),
-        ("y_deg", wavefronts.field_deg[star, 1], "deg"),
-    ]
-    for k, name in enumerate(wavefronts.terms.names):
-        # Coefficients with their standard deviation in the mode.
-        error = np.sqrt(summary["covariance"][:, k, k])
-        columns.append((name, complete(summary["mean"][:, k]), "wave"))
-        columns.append((f"{name}_error", complete(error), "wave"))
-    # The RMS belongs to the whole posterior and is the same for all modes of a star.
-    for name, waves in zip(("rms", "rms_error"), wavefronts.rms, strict=True):
-        columns.append((name, wavefronts.wavelength_nm * waves[star], "nm"))
-    for name, values in wavefronts.measured().items():
-        columns.append((name, values[star], "pix" if name[0] in "xy" else None))
-    table = Table()
-    for name, values, unit in columns:
-        # The FITS standard has no unit wave: it is in the description.
-        fits_unit = None if unit == "wave" else unit
-        table[name] = Column(values, unit=fits_unit, description=unit)
-    return table
+        columns: list[tuple[str, np.ndarray, str | None]] = [
+            ("id", stamps.id[star], None),
+            # Index of the mode: rows since the first row of the star.
+            ("mode", np.arange(star.size) - np.searchsorted(star, star), None),
+            ("probability", complete(summary["probability"]), None),
+            ("explained", self.explained[star], None),
+            ("chi2", self.chi2[star], None),
+            ("snr", self.snr[star], None),
+            ("x_deg", self.field_deg[star, 0], "deg"),
+            ("y_deg", self.field_deg[star, 1], "deg"),
+        ]
+        for k, name in enumerate(self.terms.names):
+            # Coefficients with their standard deviation in the mode.
+            error = np.sqrt(summary["covariance"][:, k, k])
+            columns.append((name, complete(summary["mean"][:, k]), "wave"))
+            columns.append((f"{name}_error", complete(error), "wave"))
+        # The RMS belongs to the whole posterior and is the same for all modes of a star.
+        for name, waves in zip(("rms", "rms_error"), self.rms, strict=True):
+            columns.append((name, self.wavelength_nm * waves[star], "nm"))
+        for name, values in self.measured().items():
+            columns.append((name, values[star], "pix" if name[0] in "xy" else None))
+        table = Table()
+        for name, values, unit in columns:
+            # The FITS standard has no unit wave: it is in the description.
+            fits_unit = None if unit == "wave" else unit
+            table[name] = Column(values, unit=fits_unit, description=unit)
+        return table

@@ -292,6 +292,6 @@ def refit_twins(
         twin_fit = twin_likelihood.maximise(twins[in_range], settings)
         # Heights are negative: the twin must be higher by more than the rounding of the deviance.
         is_higher = twin_fit.height > fit.height[in_range] * (1.0 - 1e-6)
-        best_fit.overwrite(np.flatnonzero(in_range)[is_higher], twin_fit, is_higher)
-        best_fit.evaluations[in_range] += twin_fit.evaluations
+        best_fit.put(np.flatnonzero(in_range)[is_higher], twin_fit.select(is_higher))
+        best_fit.evaluations[in_range] = fit.evaluations[in_range] + twin_fit.evaluations
     return best_fit, in_range

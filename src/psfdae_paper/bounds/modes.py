@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,7 +26,8 @@ class Knowledge(IntEnum):
     TRUTH = 2
 
 
-class Positions(NamedTuple):
+@dataclass(frozen=True)
+class Positions(Rows):
     """Positions of n draws: field (n,), offset (n, 2) in pixels, coefficients z (n, 5)."""
 
     field: np.ndarray

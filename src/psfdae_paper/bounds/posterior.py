@@ -265,11 +265,6 @@ class PosteriorSums(Rows):
         zeros = (np.zeros((stars, *shape)) for shape in shapes)
         return cls(np.full(stars, -np.inf), *zeros)
 
-    def put(self, stars: np.ndarray, replacement: PosteriorSums) -> None:
-        """Replace the sums of the stars with these numbers."""
-        for name, values in vars(replacement).items():
-            getattr(self, name)[stars] = values
-
     def rescale(self, log_scale: np.ndarray) -> PosteriorSums:
         """Return the same sums with weights relative to exp(`log_scale`), shape (n,)."""
         # A star without any possible image has scale 0 and keeps sums of zero.

@@ -11,6 +11,7 @@ brightest pixel the simulator would not frame at o get weight 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,13 +21,12 @@ from psfdae_paper.bounds.posterior import PosteriorSums
 from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
 
 
-class Draws(NamedTuple):
+@dataclass(frozen=True)
+class Draws(Positions):
     """The n draws of one star, with their propagated stamps.
 
     Attributes
     ----------
-    field, offset, z : ndarray, shapes (n,), (n, 2) and (n, 5)
-        Field, offset and coefficients, as in `Positions`.
     image : ndarray, shape (n, P), float32
         Stamp of every draw.
     jitter : ndarray of int, shape (n,)
@@ -35,9 +35,6 @@ class Draws(NamedTuple):
         Logarithm of prior × likelihood; −∞ for impossible draws.
     """
 
-    field: np.ndarray
-    offset: np.ndarray
-    z: np.ndarray
     image: np.ndarray
     jitter: np.ndarray
     log_posterior: np.ndarray
@@ -137,10 +134,9 @@ def sample_posterior(
 def _run_round(samplers: list[_Sampler], count: int, posteriors: StarPosteriors) -> None:
     """Draw once for several stars; their stamps are propagated together."""
     proposals = [sampler.propose(count) for sampler in samplers]
-    field, offset, z = (np.concatenate(column) for column in zip(*proposals, strict=True))
+    draws, limit = Positions.join(proposals), posteriors.model.max_abs_z
     # Draws outside the limit get weight 0; they are propagated at the limit.
-    limit = posteriors.model.max_abs_z
-    stamps = posteriors.model.stamps(np.clip(z, -limit, limit), field, offset)
+    stamps = posteriors.model.stamps(np.clip(draws.z, -limit, limit), draws.field, draws.offset)
     stamps = stamps.reshape(len(stamps), -1)
     ends = np.cumsum([position.field.size for position in proposals])[:-1]
     for sampler, position, images in zip(samplers, proposals, np.split(stamps, ends), strict=True):
@@ -176,12 +172,12 @@ class _Sampler:
     @property
     def draws(self) -> Draws:
         """Draws of all rounds."""
-        return Draws(*(np.concatenate(column) for column in zip(*self.rounds, strict=True)))
+        return Draws.join(self.rounds)
 
     def propose(self, count: int) -> Positions:
         """Draw about `count` positions from the mixture, adapted to the earlier draws."""
         if self.rounds:
-            self.modes = self.modes.adapt(Positions(*self.draws[:3]), self.log_weight())
+            self.modes = self.modes.adapt(self.draws, self.log_weight())
         # The density of a draw needs the mixture of its round: it is kept with the number of draws.
         position, number = self.modes.draw(count, self.star_field, self.rng)
         self.mixtures.append((self.modes, number))
@@ -204,7 +200,9 @@ class _Sampler:
         log_posterior = (ratio * self.counts).sum(axis=-1) - light
         log_posterior = log_posterior - 0.5 * (position.z**2).sum(axis=-1)
         log_posterior = np.where(possible, log_posterior, -np.inf)
-        self.rounds.append(Draws(*position, images, np.where(possible, number, 0), log_posterior))
+        jitter_number = np.where(possible, number, 0)
+        columns = position.field, position.offset, position.z, images, jitter_number
+        self.rounds.append(Draws(*columns, log_posterior))
 
     def log_weight(self) -> np.ndarray:
         """Return ln of prior × likelihood over the density of all rounds' mixtures, shape (n,)."""

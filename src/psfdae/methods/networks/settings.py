@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from psfdae.base.settings import CheckpointSeconds, Count, Group
+from psfdae.methods.bundle_info import check_layers
 
 
 class DaeSettings(Group):
@@ -28,13 +29,7 @@ class DaeSettings(Group):
     @model_validator(mode="after")
     def check_shape(self) -> DaeSettings:
         """Raise ValueError for even kernels, or a wrong number of widths."""
-        if any(k % 2 == 0 for k in self.kernels):
-            raise ValueError(f"kernels = {self.kernels}: must be odd")
-        if len(self.widths) != len(self.kernels) - 1:
-            raise ValueError(
-                f"widths = {self.widths}: {len(self.kernels)} kernels need "
-                f"{len(self.kernels) - 1} widths, not {len(self.widths)}"
-            )
+        check_layers(self.kernels, self.widths)
         return self
 
 
