@@ -272,15 +272,11 @@ class Denoiser(ABC):
     def _predict(self, centred_stars: CentredStars, denoised_stars: DenoisedStars) -> Prediction:
         """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
         info, errors = self.bundle.info, self.bundle.errors
-        stars, flags, photometry = (
-            centred_stars.stars,
-            centred_stars.flags,
-            denoised_stars.photometry,
-        )
-        psf, sigma = denoised_stars.psf, denoised_stars.sigma
+        stars, flags = centred_stars.stars, centred_stars.flags
+        psf, sigma, photometry, has_no_flux = denoised_stars[:4]
         # Noise divided by the flux, as in the training: errors and limits depend on it. PSFs and
         # fluxes are sums of pixels, which have more noise where pixels share it.
-        noise = photometry.noise / np.where(denoised_stars.has_no_flux, np.nan, photometry.flux)
+        noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
         noise *= stars.noise_correlation
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
@@ -494,11 +490,8 @@ def measure_stars(centred_stars: CentredStars, method: Method, errors: ErrorMode
     errors : ErrorModel
         Errors of measured stars due to the PSF model, which are added to the method's errors.
     """
-    stars, photometry, border_level = (
-        centred_stars.stars,
-        centred_stars.photometry,
-        centred_stars.border_level,
-    )
+    stars, photometry = centred_stars.stars, centred_stars.photometry
+    border_level = centred_stars.border_level
     # Stamps above the level of their border; the measured sky is relative to it, too.
     data, noise, is_unusable = centred_stars.repair_stamps()
     flux_is_given = np.isfinite(stars.flux)

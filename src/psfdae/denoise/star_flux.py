@@ -136,19 +136,16 @@ class Photometer:
         self,
         photometry: Photometry,
         group: np.ndarray,
-        estimate: Photometry,
+        padded_estimate: Photometry,
         sky: np.ndarray,
         given_stars: Stamps,
     ) -> None:
         """Overwrite rows `group` of a photometry by an estimate, of which they are the first."""
         # A flux that is given counts, and so do the repaired pixels and their noise.
-        count = group.size
+        count, estimate = group.size, padded_estimate.select(slice(group.size))
         known_flux, known_noise = given_stars.flux[group], given_stars.noise[group]
-        has_flux, filled_pixels = (
-            np.isfinite(known_flux),
-            estimate.images[:count].reshape(count, -1),
-        )
-        fitted_flux, fit_flags = estimate.flux[:count], estimate.flags[:count]
+        has_flux, filled_pixels = np.isfinite(known_flux), estimate.images.reshape(count, -1)
+        fitted_flux, fit_flags = estimate.flux, estimate.flags
         is_fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
         # NO_FLUX: the star was not fitted, if the flux is below its error and not given, or
         # if it has no image in single precision. A flux that is given is not faint.
@@ -159,27 +156,29 @@ class Photometer:
         flags[has_flux] &= ~np.uint16(StarFlag.FAINT)
         raise_flag(flags, StarFlag.NO_FLUX, is_lost)
         # The sky that is left, b = mean(x) − F/P, and images of flux 1 without it.
-        residual_sky = (
-            filled_pixels.mean(axis=1) - np.nan_to_num(fitted_flux) / filled_pixels.shape[1]
-        )
+        flux_per_pixel = np.nan_to_num(fitted_flux) / filled_pixels.shape[1]
+        residual_sky = filled_pixels.mean(axis=1) - flux_per_pixel
         residual_sky = np.where(np.isfinite(given_stars.background[group]), 0.0, residual_sky)
         images = (filled_pixels - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
         images[is_lost] = 0.0
         # The noise as of other stars, by the pixels of the border that were used.
-        known_images = np.tile(self.model.mean.astype(np.float32), (len(estimate.flux), 1))
+        known_images = np.tile(self.model.mean.astype(np.float32), (len(padded_estimate.flux), 1))
         known_images[:count] = images
         # These are images of flux 1 without sky, both known here: only the noise is fitted.
-        unit, is_used = np.ones(len(known_images)), estimate.is_used.reshape(known_images.shape)
-        noise = (
-            self.leading.fit(known_images, unit > 0, unit, np.nan * unit, is_used).noise[:count]
-            * flux
-        )
-        noise = np.where(is_lost, estimate.noise[:count], noise)
+        unit, is_used = np.ones(len(known_images)), padded_estimate.is_used
+        sky_known, unknown_noise = unit > 0, np.nan * unit
+        is_used = is_used.reshape(known_images.shape)
+        fit = self.leading.fit(known_images, sky_known, unit, unknown_noise, is_used)
+        noise = fit.noise[:count] * flux
+        noise = np.where(is_lost, estimate.noise, noise)
         # Rows of the photometry; given values stay unchanged.
-        photometry.flux[group] = flux
-        photometry.flux_error[group] = np.where(has_flux, np.nan, estimate.flux_error[:count])
-        photometry.background[group] = sky + np.where(is_fitted, residual_sky, 0.0)
-        photometry.noise[group] = np.where(np.isfinite(known_noise), known_noise, noise)
-        photometry.images[group] = images.reshape(estimate.images[:count].shape)
-        photometry.is_used[group] = estimate.is_used[:count]
-        photometry.flags[group] = flags
+        replacement = Photometry(
+            flux=flux,
+            flux_error=np.where(has_flux, np.nan, estimate.flux_error),
+            background=sky + np.where(is_fitted, residual_sky, 0.0),
+            noise=np.where(np.isfinite(known_noise), known_noise, noise),
+            images=images.reshape(estimate.images.shape),
+            is_used=estimate.is_used,
+            flags=flags,
+        )
+        photometry.put(group, replacement)

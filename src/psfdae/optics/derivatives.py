@@ -9,7 +9,7 @@ polynomials. The field of such a product is two matrix products with weighted ma
 along x are shared by all b, so that all directions together take the time of a few stamps. Where
 directions are few and modes many, a field for each direction takes less time.
 
-There are three ways from the pupil to the pixels, each of them a `Sampling`:
+There are three ways from the pupil to the pixels, each of them a `propagation.Sampling`:
 
 - `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
   narrower than the image's period;
@@ -23,14 +23,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
 from psfdae.optics.propagation import (
+    FieldPropagator,
     Precision,
+    Sampling,
     StampPropagator,
-    complex_field,
     image_points,
     real_dtype,
     run_grids,
@@ -47,44 +47,6 @@ from psfdae.optics.wavefronts import (
 
 StampsAndSlopes = tuple[np.ndarray, np.ndarray]
 """Stamps (B, d, d), or intensities at points, and derivatives of the stamps, (B, K, d, d)."""
-
-
-class Sampling(Protocol):
-    """Points of the image plane, and their contributions to the pixels of a stamp."""
-
-    dtype: np.dtype
-    """float32 or float64, of the pixels."""
-
-    product_cost: float
-    """Measured time for a product of polynomials, over the time for a single direction."""
-
-    propagator: StampPropagator | None
-    """Faster propagation of stamps without derivatives, if there is one."""
-
-    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
-
-        Parameters
-        ----------
-        pupil_fields : ndarray, shape (B, M, M)
-            Complex fields in the pupil, indexed [wavefront, y, x].
-        degrees : sequence of A int
-            Degrees of Legendre polynomials.
-
-        Returns
-        -------
-        ndarray, shape (A, B, M, m)
-            Field over pupil y and the points along x.
-        """
-
-    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """Propagate columns of such fields (B, M, m), times P_b(y) for all degrees b, to points.
-
-        The result (A, B, m, m) is the field at the points, up to a common phase of each point.
-        """
-
-    def to_pixels(self, values: np.ndarray) -> np.ndarray:
-        """Return pixels (..., d, d) of intensities, or their slopes, at the points (..., m, m)."""
 
 
 class SeparableSampling:
@@ -223,12 +185,10 @@ class ModalStamps:
         self.dtype = dtype = sampling.dtype
         self.shape = pupil.amplitude.shape
         self._sampling = sampling
-        self._pixel = pixel
-        self._axis = pupil.axis.astype(dtype)
-        # Images of the modes as rows of a matrix, and the transmission for a total light of 1.
+        self._propagator = FieldPropagator(pupil, sampling, pixel)
+        # Images of the modes as rows of a matrix.
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
-        self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
         # Modes as sums of products P_a(x) P_b(y), for derivatives along many directions.
         degrees, coefficients = legendre_expansion(modes)
         self._coefficients = coefficients.astype(dtype)
@@ -254,13 +214,7 @@ class ModalStamps:
         ndarray, shape (B, d, d)
             Fraction of the light through the pupil on each pixel.
         """
-        sampling = self._sampling
-        if sampling.propagator is not None:
-            return sampling.propagator(self.opd(coefficients), offset_px)
-        # The field by two transforms, and the light on the pixels from its intensity.
-        (rows,) = sampling.along_x(self._pupil_fields(coefficients, offset_px))
-        (field,) = sampling.along_y(rows)
-        return sampling.to_pixels(field.real**2 + field.imag**2)
+        return self._propagator(self.opd(coefficients), offset_px)
 
     def derivatives(
         self,
@@ -290,7 +244,7 @@ class ModalStamps:
             Per unit parameter.
         """
         directions = directions.astype(self.dtype)
-        pupil_fields = self._pupil_fields(coefficients, offset_px)
+        pupil_fields = self._propagator.pupil_fields(self.opd(coefficients), offset_px)
         # The cheaper way: a field for each direction, or for each product of polynomials.
         if directions.shape[1] < self._sampling.product_cost * len(self._products):
             intensity, slopes = self._use_directions(pupil_fields, directions)
@@ -348,16 +302,6 @@ class ModalStamps:
         # W = Σ c_j M_j at all samples, as one matrix product.
         opd = np.asarray(coefficients, self._modes.dtype) @ self._modes
         return np.asarray(opd.reshape(-1, *self.shape))
-
-    def _pupil_fields(self, coefficients: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
-        """Return A exp(2πiW) of a batch, with the tilt that shows the image at an offset."""
-        phase = self.opd(coefficients) * (2.0 * np.pi)
-        if offset_px is not None:
-            # A shift of the stamp by +u is a tilt that moves the image by −u.
-            tilt = (np.pi * self._pixel * np.asarray(offset_px, float)).astype(phase.dtype)
-            phase -= tilt[:, 0, None, None] * self._axis[:, None]
-            phase -= tilt[:, 1, None, None] * self._axis
-        return complex_field(phase, self._amplitude)
 
 
 class SampledStamps:

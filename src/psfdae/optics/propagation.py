@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -290,6 +290,84 @@ class StampPropagator:
         if name not in buffers or len(buffers[name]) < size:
             buffers[name] = self._array(np.empty(size, self.real_dtype))
         return buffers[name][:size].reshape(shape)
+
+
+class Sampling(Protocol):
+    """Points of the image plane, and their contributions to the pixels of a stamp."""
+
+    dtype: np.dtype
+    """float32 or float64, of the pixels."""
+
+    product_cost: float
+    """Measured time for a product of polynomials, over the time for a single direction."""
+
+    propagator: StampPropagator | None
+    """Faster propagation of stamps without derivatives, if there is one."""
+
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
+
+        Parameters
+        ----------
+        pupil_fields : ndarray, shape (B, M, M)
+            Complex fields in the pupil, indexed [wavefront, y, x].
+        degrees : sequence of A int
+            Degrees of Legendre polynomials.
+
+        Returns
+        -------
+        ndarray, shape (A, B, M, m)
+            Field over pupil y and the points along x.
+        """
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """Propagate columns of such fields (B, M, m), times P_b(y) for all degrees b, to points.
+
+        The result (A, B, m, m) is the field at the points, up to a common phase of each point.
+        """
+
+    def to_pixels(self, values: np.ndarray) -> np.ndarray:
+        """Return pixels (..., d, d) of intensities, or their slopes, at the points (..., m, m)."""
+
+
+class FieldPropagator:
+    """Operator from batches of OPD maps to stamps, for any sampling of the image.
+
+    Parameters
+    ----------
+    pupil : Pupil
+        Transmission on an M × M grid.
+    sampling : Sampling
+        Points of the image, made for the same pupil.
+    pixel : float
+        Pixel width in λ/D; the unit of offsets.
+    """
+
+    def __init__(self, pupil: Pupil, sampling: Sampling, pixel: float) -> None:
+        self.real_dtype, self._sampling, self._pixel = sampling.dtype, sampling, pixel
+        self._axis = pupil.axis.astype(self.real_dtype)
+        # The transmission is divided by the root of the pupil's light, for a total light of 1.
+        self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
+
+    def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
+        """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, shifted by (B, 2) pixels."""
+        sampling = self._sampling
+        if sampling.propagator is not None:
+            return sampling.propagator(opd, offset_px)
+        # The field by two transforms, and the light on the pixels from its intensity.
+        (rows,) = sampling.along_x(self.pupil_fields(opd, offset_px))
+        (field,) = sampling.along_y(rows)
+        return sampling.to_pixels(field.real**2 + field.imag**2)
+
+    def pupil_fields(self, opd: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
+        """Return A exp(2πiW) of a batch, with the tilt that shows the image at an offset."""
+        phase = opd.astype(self.real_dtype, copy=False) * (2.0 * np.pi)
+        if offset_px is not None:
+            # A shift of the stamp by +u is a tilt that moves the image by −u.
+            tilt = (np.pi * self._pixel * np.asarray(offset_px, float)).astype(phase.dtype)
+            phase -= tilt[:, 0, None, None] * self._axis[:, None]
+            phase -= tilt[:, 1, None, None] * self._axis
+        return complex_field(phase, self._amplitude)
 
 
 def run_grids(

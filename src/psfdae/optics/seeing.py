@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from psfdae.optics.propagation import Precision, complex_field, real_dtype
+from psfdae.optics.propagation import FieldPropagator, Precision, real_dtype
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import legendre
 
@@ -185,35 +185,29 @@ class BlurredSampling(WholePeriod):
         # Lag k has the frequency ½ k · spacing in cycles per λ/D; fftfreq gives k/n.
         n = self.points
         step = 0.5 * pupil.spacing * pixel * n
-        self._row_frequency = step * fft.fftfreq(n)
-        self._column_frequency = step * fft.rfftfreq(n)
-        rows, columns = self._row_frequency[:, None], self._column_frequency
+        rows, columns = step * fft.fftfreq(n)[:, None], step * fft.rfftfreq(n)
         multiplicity = np.where(columns == 0.0, 1.0, 2.0)
         # Transfer functions of the pixel and of the profile.
         blur = profile.transfer(np.hypot(rows, columns) / pixel)
         weights = multiplicity * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
         self._transfer = (weights * blur).astype(self.dtype)
-        self._complex = np.dtype(precision)
-        self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
+        # The inverse transform from the lags only to the centres of the pixels.
+        centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
+        self._to_rows, self._to_columns = (
+            np.exp(2j * np.pi * np.outer(centres, frequency)).astype(precision)
+            for frequency in (rows.ravel(), columns)
+        )
 
-    def to_pixels(
-        self, values: np.ndarray, offset_px: Sequence[float] | np.ndarray = (0, 0)
-    ) -> np.ndarray:
-        """Return pixels (..., d, d) of intensities (..., n, n) about a position (row, column)."""
+    def to_pixels(self, values: np.ndarray) -> np.ndarray:
+        """Return pixels (..., d, d) of intensities (..., n, n)."""
         from scipy import fft
 
-        # Lags c_l of the intensity times the transfer functions, and the inverse transform only at
-        # the centres of the pixels.
+        # Lags c_l of the intensity times the transfer functions.
         spectrum = fft.rfft2(values) * self._transfer
-        frequencies = (self._row_frequency, self._column_frequency)
-        to_rows, to_columns = (
-            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self._complex)
-            for offset, frequency in zip(offset_px, frequencies, strict=True)
-        )
-        return np.asarray(((to_rows @ spectrum) @ to_columns.T).real)
+        return np.asarray(((self._to_rows @ spectrum) @ self._to_columns.T).real)
 
 
-class BlurredPropagator:
+class BlurredPropagator(FieldPropagator):
     """Propagator from OPD maps to blurred stamps, with the parameters of `StampPropagator`.
 
     Works with numpy only, in any number of threads.
@@ -227,20 +221,5 @@ class BlurredPropagator:
         profile: Profile,
         precision: Precision = "complex128",
     ) -> None:
-        # The transmission is divided by the root of the pupil's light, for a total light of 1.
-        self._sampling = BlurredSampling(pupil, stamp_px, pixel, profile, precision)
-        self.real_dtype = self._sampling.dtype
-        self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
-
-    def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Return stamps (B, d, d) of OPD maps (B, M, M) in waves, shifted by (B, 2) pixels."""
-        offset_px = np.zeros((len(opd), 2)) if offset_px is None else offset_px
-        # Field of the pupil, field at the points of a period, and blurred pixels, star by star,
-        # because each star has its own offset.
-        stamps = []
-        for waves, offset in zip(opd, offset_px, strict=True):
-            phase = (2.0 * np.pi) * waves.astype(self.real_dtype)
-            (rows,) = self._sampling.along_x(complex_field(phase, self._amplitude)[None])
-            image = self._sampling.along_y(rows)[0, 0]
-            stamps.append(self._sampling.to_pixels(image.real**2 + image.imag**2, offset))
-        return np.stack(stamps)
+        sampling = BlurredSampling(pupil, stamp_px, pixel, profile, precision)
+        super().__init__(pupil, sampling, pixel)

@@ -22,7 +22,8 @@ from psfdae.base.rng import stream
 from psfdae.base.rows import Rows
 from psfdae.image.sky import border_median, border_scatter
 from psfdae.image.stamps import Stamps
-from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling, StampsAndSlopes
+from psfdae.optics.derivatives import PointSampling, SampledStamps, StampsAndSlopes
+from psfdae.optics.propagation import Sampling
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
 from psfdae.sensing.climbing import (
