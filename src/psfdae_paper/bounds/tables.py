@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Set
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from psfdae.base.files import Product, ProductError
 from psfdae.methods import method as method_named
@@ -26,9 +26,6 @@ from psfdae_paper.bounds.floor import Comparison, compute_local_error
 from psfdae_paper.bounds.posterior import Bank, Likelihood, compute_exact_posterior, extrapolate
 from psfdae_paper.bounds.tight import Evidence, calibration
 from psfdae_paper.configuration.schema import Config
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
 """Bounds that are posterior means; True if the star's field is known."""
@@ -98,8 +95,6 @@ class Tables:
         **columns : float
             Further columns.
         """
-        import pandas as pd
-
         # Columns that all metrics share.
         key: dict[str, object] = {
             "dataset": self.dataset,

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from psfdae.base.settings import ConfigError
 from psfdae.commands import cli
-
-if TYPE_CHECKING:
-    from psfdae_paper.configuration.schema import Config
+from psfdae_paper.configuration.compose import load_settings, load_stage
+from psfdae_paper.configuration.schema import Config
 
 Function = TypeVar("Function", bound=Callable[..., None])
 
@@ -74,9 +73,6 @@ class Groups:
         ConfigError
             With each wrong key, its value and the allowed range.
         """
-        # Hydra and pydantic models are imported for commands that need them only.
-        from psfdae_paper.configuration.compose import load_settings, load_stage
-
         # The workflow passes one file; a user writes words such as noise.kappa=4.98.
         # Some commands read other groups with other options, such as `fit METHOD`.
         reads = self.names(options)

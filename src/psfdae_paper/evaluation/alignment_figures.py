@@ -17,6 +17,7 @@ from psfdae.base.types import Axes, AxesImage, Figure, FigureBase
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.evaluation import drawing
+from psfdae_paper.evaluation.drawing import Style
 
 
 def parameter_label(parameter: str) -> str:
@@ -50,11 +51,16 @@ def draw_stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str
                 images.append(_draw_stamp(axes, stamp, peak))
             row_panels[0].set_ylabel(label, rotation=0, ha="right", va="center")
         _add_flux_bar(part, images[-1], panels, "flux / maximum of the noise-free stamps")
-        # The first field is the centre, the others are on a circle around it.
-        for field, axes in enumerate(panels[0]):
-            axes.set_title("centre" if field == 0 else f"{360 * (field - 1) // (fields - 1)}°")
+        _name_fields(panels[0])
         part.suptitle(title, fontsize=10)
     return figure
+
+
+def _name_fields(panels: np.ndarray, **style: float) -> None:
+    """Write the positions of fields above a row of panels: the centre, then angles on a circle."""
+    for field, axes in enumerate(panels):
+        angle_deg = 360 * (field - 1) // (len(panels) - 1) if field else 0
+        axes.set_title(f"{angle_deg}°" if field else "centre", **style)
 
 
 def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> AxesImage:
@@ -117,44 +123,37 @@ def draw_predictions(
     return figure
 
 
-def compute_size(states: np.ndarray) -> np.ndarray:
-    """Return the size of misalignments: RMS of their four numbers, in units of the range, (n,)."""
-    # √⟨t²⟩ over decentre x, y and tilt x, y.
-    size: np.ndarray = np.sqrt((states**2).mean(axis=1))
-    return size
-
-
 @apply_style
 def draw_errors_by_size(
-    curves: Mapping[float, Mapping[str, tuple[np.ndarray, np.ndarray]]], title: str
+    truth: np.ndarray, curves: Mapping[float, Mapping[str, np.ndarray]]
 ) -> Figure:
     """Draw the mean absolute error against the size of the misalignment.
 
-    There is one panel per noise level; states are averaged in bins of size.
+    There is one panel per noise level; states are averaged in bins of size, the RMS of their four
+    numbers.
 
     Parameters
     ----------
-    curves : by noise level and method, size (n,) and error (n,) of every state
+    truth : ndarray, shape (n, 4)
+        States in units of the range.
+    curves : by noise level and method, error (n,) of every state
         The error is averaged over the four parameters.
-    title : str
-        Title of the figure.
     """
+    # √⟨t²⟩ over decentre x, y and tilt x, y.
+    size = np.sqrt((truth**2).mean(axis=1))
     figure = new_figure(3.9, layout="constrained")
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for axes, (level, methods) in zip(panels, curves.items(), strict=True):
         # Bounds are dashed lines, estimates have standard errors.
-        for method, (size, error) in methods.items():
+        for method, error in methods.items():
             mean_size, mean_error, stderr = bin_errors(size, error)
-            style = {
-                "color": ESTIMATORS[method].look.color,
-                "label": ESTIMATORS[method].look.label,
-                "lw": 1.4,
-            }
+            look = ESTIMATORS[method].look
+            style: Style = {"color": look.color, "label": look.label, "lw": 1.4}
             if method == "cramer_rao":
                 axes.plot(mean_size, mean_error, ls="--", **style)
             else:
-                marker = {"marker": "o", "ms": 3.5, "capsize": 2}
-                axes.errorbar(mean_size, mean_error, stderr, **marker, **style)
+                style |= {"marker": "o", "ms": 3.5, "capsize": 2}
+                axes.errorbar(mean_size, mean_error, stderr, **style)
         axes.set_title(f"λ = {level:g}")
         axes.set_xlabel("RMS of the state's four numbers / range")
         axes.set_yscale("log")
@@ -164,20 +163,16 @@ def draw_errors_by_size(
     panels[0].set_ylabel("mean absolute error / range")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(title)
+    figure.suptitle(f"Errors against misalignment, {len(truth)} uniform states")
     return figure
 
 
-def bin_errors(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bin_errors(size: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Return mean size, mean error and its standard error in six bins of equally many states."""
     # States by size, cut into groups of equally many; a group of n has the error σ/√n of its mean.
-    order = np.argsort(size, kind="stable")
-    bins = [states for states in np.array_split(order, 6) if states.size]
-    mean_size, mean_error = (
-        np.array([values[states].mean() for states in bins]) for values in (size, error)
-    )
-    stderr = np.array([error[states].std() / np.sqrt(states.size) for states in bins])
-    return mean_size, mean_error, stderr
+    bins = [b for b in np.array_split(np.argsort(size, kind="stable"), 6) if b.size]
+    rows = [(size[b].mean(), error[b].mean(), error[b].std() / np.sqrt(b.size)) for b in bins]
+    return np.array(rows).T
 
 
 @apply_style
@@ -271,9 +266,7 @@ def _draw_twin_stamps(
             axes.set_yticks([])
         upper[0].set_ylabel(f"state\n{label}", rotation=0, ha="right", va="center")
         lower[0].set_ylabel("twin −\nstate", rotation=0, ha="right", va="center")
-    for field, axes in enumerate(stamp_panels[0]):
-        circle = len(stamp_panels[0]) - 1
-        axes.set_title("centre" if field == 0 else f"{360 * (field - 1) // circle}°", fontsize=8)
+    _name_fields(stamp_panels[0], fontsize=8)
     # Each colour bar is beside half of the rows, but belongs to every second one.
     upper_half, lower_half = np.split(stamp_panels, 2)
     _add_flux_bar(figure, grey, upper_half, "states: flux / maximum")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ from psfdae_paper.evaluation.paper import read_published
 Row = dict[str, object]
 """Row of a table: values by column."""
 
-Key = Mapping[str, object]
+Key = Mapping[str, Any]
 """First columns of a row: test_set, noise_level and method."""
 
 
@@ -209,15 +210,9 @@ def _pivot(
     Rows are sorted by the index, methods in the order of `ESTIMATORS`.
     """
     # A column for each parameter or pair.
-    methods = list(ESTIMATORS)
-    table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
-    table.columns.name = None
-    # Methods by their rank in the configuration, other keys by value.
-    rank = table["method"].map(methods.index)
-    keys = [rank if name == "method" else table[name] for name in index]
-    # `lexsort` sorts by its last key first.
-    order = np.lexsort([key.to_numpy() for key in reversed(keys)])
-    return table.iloc[order].reset_index(drop=True)
+    rows = rows.assign(method=pd.Categorical(rows["method"], list(ESTIMATORS)))
+    table = rows.pivot(index=index, columns=column, values="value")[column_order]
+    return table.sort_index().rename_axis(columns=None).reset_index()
 
 
 def format_table(table: pd.DataFrame, digits: dict[str, str]) -> pd.DataFrame:
@@ -241,10 +236,9 @@ def format_table(table: pd.DataFrame, digits: dict[str, str]) -> pd.DataFrame:
             for value, quantity in zip(table[column], quantities, strict=True)
         ]
     # The paper's rows have its own names of the methods.
-    paper_labels = {a.name: a.look.paper[1] for a in ESTIMATORS.values() if a.look.paper}
+    looks = zip(table["source"], (ESTIMATORS[name].look for name in table["method"]), strict=True)
     text_table["method"] = [
-        paper_labels[method] if source == "paper" else ESTIMATORS[method].look.label
-        for method, source in zip(table["method"], table["source"], strict=True)
+        look.paper[1] if source == "paper" and look.paper else look.label for source, look in looks
     ]
     return text_table
 

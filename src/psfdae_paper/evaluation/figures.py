@@ -8,6 +8,7 @@ field are both drawn with y upwards.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,7 +101,7 @@ def draw_energy(energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_p
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
     # A coloured cell for each field point, with its number where there is room.
-    image = _draw_values(axes, energy, grid, field, "viridis")
+    image = _draw_mosaic(axes, energy[:, None, None], grid, field, gap=0, cmap="viridis")
     _label_axes(axes, field)
     # On grids with more than 15 points a side the numbers would touch.
     if grid.max() < 15:
@@ -109,8 +110,7 @@ def draw_energy(energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_p
         f"Light inside the stamp of {stamp_px} × {stamp_px} px: min {energy.min():.2f}, "
         f"median {np.median(energy):.2f}, max {energy.max():.2f}"
     )
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02)
-    bar.set_label("fraction of the star's light")
+    figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, label="fraction of the star's light")
     return figure
 
 
@@ -165,8 +165,9 @@ def _draw_map(
     # Colours span at least 5 % of the values, so that rounding errors do not look like structure.
     middle = 0.5 * (values.min() + values.max())
     half_range = 0.5 * max(float(np.ptp(values)), 0.05 * middle)
-    limits = (middle - half_range, middle + half_range)
-    image = _draw_values(axes, values, fields.grid, fields.field, cmap, *limits)
+    style = {"cmap": cmap, "vmin": middle - half_range, "vmax": middle + half_range}
+    # A value is a stamp of one pixel, drawn without gaps.
+    image = _draw_mosaic(axes, values[:, None, None], fields.grid, fields.field, gap=0, **style)
     axes.set_ylabel(f"y ({to_field_unit(fields.field)[1]})")
     axes.set_title(f"{title}: {values.min():.2f} … {values.max():.2f}")
     axes.figure.colorbar(image, ax=axes, shrink=0.9)
@@ -178,40 +179,32 @@ def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray)
     from matplotlib import colormaps
 
     # Square roots make the wings visible, which have a few per cent of the maximum.
-    share = psf / psf.max(axis=(1, 2), keepdims=True)
-    gap = 1  # pixels between stamps
-    image = axes.imshow(
-        make_mosaic(np.sqrt(np.clip(share, 0.0, None)), grid, gap),
-        origin="lower",
-        extent=_extent(grid, field, psf.shape[-1], gap),
-        cmap=colormaps[STAMP_MAP].with_extremes(bad="#b0b0b0"),
-        vmin=0.0,
-        vmax=1.0,
-        interpolation="nearest",
-    )
+    root = np.sqrt(np.clip(psf / psf.max(axis=(1, 2), keepdims=True), 0.0, None))
+    colors = colormaps[STAMP_MAP].with_extremes(bad="#b0b0b0")
+    image = _draw_mosaic(axes, root, grid, field, gap=1, cmap=colors, vmin=0.0, vmax=1.0)
     _label_axes(axes, field)
     return image
 
 
-def _draw_values(
-    axes: Axes,
-    values: np.ndarray,
-    grid: np.ndarray,
-    field: np.ndarray,
-    cmap: str,
-    vmin: float | None = None,
-    vmax: float | None = None,
+def _draw_mosaic(
+    axes: Axes, stamps: np.ndarray, grid: np.ndarray, field: np.ndarray, gap: int, **style: Any
 ) -> AxesImage:
-    """Draw a value of each field point (F,) as a coloured cell."""
+    """Draw stamps (F, d, d), the centre of each at its field point, with `gap` pixels between."""
+    (position, _), side = to_field_unit(field), stamps.shape[-1]
+    # Width of a pixel of the mosaic in the unit of the axes, from the spacing of the field points.
+    # A single field point has an arbitrary width.
+    intervals = grid.max(axis=0)
+    low, high = position.min(axis=0), position.max(axis=0)
+    spacing = np.where(intervals > 0, (high - low) / np.maximum(intervals, 1), 1.0)
+    # The centre of the outermost stamps is gap + side/2 pixels from the edge of the mosaic.
+    margin = (gap + 0.5 * side) * (spacing / (side + gap))
+    (left, bottom), (right, top) = low - margin, high + margin
     return axes.imshow(
-        # A value is a stamp of one pixel, drawn without gaps.
-        make_mosaic(values[:, None, None], grid, gap=0),
+        make_mosaic(stamps, grid, gap),
         origin="lower",
-        extent=_extent(grid, field, 1, 0),
-        cmap=cmap,
-        vmin=vmin,
-        vmax=vmax,
+        extent=(left, right, bottom, top),
         interpolation="nearest",
+        **style,
     )
 
 
@@ -226,30 +219,6 @@ def _write_values(
         # Luma of ITU-R BT.601, the brightness that the eye perceives.
         color = "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.5 else "black"
         axes.text(x, y, f"{value:.2f}", ha="center", va="center", color=color, fontsize=fontsize)
-
-
-def _extent(
-    grid: np.ndarray, field: np.ndarray, side: int, gap: int
-) -> tuple[float, float, float, float]:
-    """Return the edges (left, right, bottom, top) of a mosaic.
-
-    With these edges the centre of each stamp is at its field point.
-    """
-    position, _ = to_field_unit(field)
-    pitch = side + gap  # pixels from one stamp to the next
-
-    # The centre of a stamp is gap + side/2 pixels from the edge of the mosaic.
-    def edges(axis: int) -> tuple[float, float]:
-        points = int(grid[:, axis].max()) + 1
-        # Width of a pixel of the mosaic in the unit of the axes, from the spacing of the field
-        # points.
-        first, last = position[:, axis].min(), position[:, axis].max()
-        # A single field point has an arbitrary width.
-        pixel = ((last - first) / (points - 1) if points > 1 else 1.0) / pitch
-        margin = (gap + 0.5 * side) * pixel
-        return first - margin, last + margin
-
-    return *edges(0), *edges(1)
 
 
 def _label_axes(axes: Axes, field: np.ndarray) -> None:

@@ -13,11 +13,12 @@ from string import Template
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from psfdae.base.figures import SERIES_COLORS, StripRow, apply_style, new_figure, restoration_strip
 from psfdae.base.files import ProductError
 from psfdae.base.reading import read_table
-from psfdae.base.types import DataFrame, Figure
+from psfdae.base.types import Figure
 from psfdae.image.tables import html_table
 from psfdae.report.page import image_tag
 from psfdae.stars.moments import SIGMA_OF_MAD
@@ -51,7 +52,7 @@ LIMITS = {
 """Minimum excess over the neighbours in time for which an image is poor, and the reason given."""
 
 
-def add_verdicts(night: DataFrame) -> DataFrame:
+def add_verdicts(night: pd.DataFrame) -> pd.DataFrame:
     """Return a table of a night with a verdict on each image, and the reason for it.
 
     A quantity of an image is compared with its median over the eleven images about it in time. It
@@ -60,7 +61,7 @@ def add_verdicts(night: DataFrame) -> DataFrame:
 
     Parameters
     ----------
-    night : DataFrame
+    night : pd.DataFrame
         Rows in the order of time; the column `reason` says why an image has no model.
     """
     # A night without any model lacks the columns of measurements.
@@ -78,7 +79,7 @@ def add_verdicts(night: DataFrame) -> DataFrame:
     return night
 
 
-def read_night(path: Path, *columns: str) -> DataFrame:
+def read_night(path: Path, *columns: str) -> pd.DataFrame:
     """Return the table of a night, or of a part of it, with names as texts.
 
     Parameters
@@ -93,8 +94,6 @@ def read_night(path: Path, *columns: str) -> DataFrame:
     ProductError
         If the file is missing or damaged, or lacks a column.
     """
-    import pandas as pd
-
     # Measurements, and columns of the list that are nothing but numbers, become numbers.
     table = read_table(path, *columns, dtype=str, keep_default_na=False)
     for name in table.columns.difference([*TEXT_COLUMNS]):
@@ -110,10 +109,8 @@ def read_night(path: Path, *columns: str) -> DataFrame:
     return table
 
 
-def read_times(night: DataFrame) -> tuple[Any, str]:
+def read_times(night: pd.DataFrame) -> tuple[Any, str]:
     """Return the time of each image, or its number where times are missing, and their label."""
-    import pandas as pd
-
     time = pd.to_datetime(night.time, errors="coerce", format="ISO8601")
     if time.notna().sum() == night.fwhm_px_centre.notna().sum():
         return time, "time (UT)"
@@ -121,7 +118,7 @@ def read_times(night: DataFrame) -> tuple[Any, str]:
 
 
 @apply_style
-def draw_telescope_numbers(night: DataFrame, names: Sequence[str]) -> Figure:
+def draw_telescope_numbers(night: pd.DataFrame, names: Sequence[str]) -> Figure:
     """Draw numbers of the telescope, columns of the night's table, with their errors against time.
 
     The columns with the errors have `_error` at the end of their names.
@@ -142,7 +139,7 @@ def draw_telescope_numbers(night: DataFrame, names: Sequence[str]) -> Figure:
 
 
 @apply_style
-def draw_night(night: DataFrame) -> Figure:
+def draw_night(night: pd.DataFrame) -> Figure:
     """Draw FWHM and ellipticity at five positions, and the brightness of stars, against time."""
     figure = new_figure(6.5, layout="constrained")
     panels: Any = figure.subplots(3, 1, sharex=True)
@@ -174,12 +171,12 @@ def draw_night(night: DataFrame) -> Figure:
     return figure
 
 
-def night_page(night: DataFrame, psfs: Mapping[str, np.ndarray], folder: str) -> str:
+def night_page(night: pd.DataFrame, psfs: Mapping[str, np.ndarray], folder: str) -> str:
     """Return the page of a night as HTML.
 
     Parameters
     ----------
-    night : DataFrame
+    night : pd.DataFrame
         Table with verdicts.
     psfs : mapping of str to ndarray, shape (5, d, d)
         PSFs at `PLACES` of some images, by label.

@@ -5,7 +5,7 @@ Inputs: tables of numbers. Outputs: tables of texts, and files of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Annotated
@@ -94,35 +94,33 @@ def tabulate_methods(metrics: pd.DataFrame, metric: str) -> pd.DataFrame:
     return table
 
 
-def write_readable(path: Path, table: pd.DataFrame, title: str, note: str = "") -> None:
-    """Write a table of texts as Markdown, and beside it as LaTeX, with the ending .tex.
+def write_tables(
+    tables: Mapping[Path, tuple[str, pd.DataFrame]], page: Path, note: str = ""
+) -> None:
+    """Write tables of texts as Markdown and LaTeX, and all of them as one page of HTML.
 
     Parameters
     ----------
-    path : Path
-        File of the Markdown.
-    table : DataFrame
-        Texts.
-    title : str
-        Line above the table; caption in LaTeX.
+    tables : mapping
+        Title and texts of each table by a path; the endings of its files are .md and .tex.
+        The title is the line above the table, and the caption in LaTeX.
+    page : Path
+        HTML page.
     note : str
         How the run differs from the paper's; empty if it does not.
     """
-    markdown = table.to_markdown(index=False, disable_numparse=True)
-    heading = f"{title}\n\n**{note}**" if note else title
-    write_text(path.with_suffix(".md"), f"{heading}\n\n{markdown}\n")
-    # LaTeX escapes the texts; signs that need mathematics follow.
-    caption = f"{title.rstrip('.')}. {note}".rstrip(". ").replace("_", r"\_").replace("%", r"\%")
-    is_long = len(table) > PAGE_ROWS
-    latex = table.to_latex(index=False, escape=True, caption=caption, longtable=is_long)
-    for sign, command in LATEX_SIGNS.items():
-        latex = latex.replace(sign, command)
-    write_text(path.with_suffix(".tex"), latex)
-
-
-def write_page(path: Path, tables: Sequence[tuple[str, pd.DataFrame]], note: str = "") -> None:
-    """Write tables of texts, each with a title, as one HTML page with a note above them."""
     parts = [f'<p class="note">{escape(note)}</p>'] if note else []
-    for title, table in tables:
+    for path, (title, table) in tables.items():
+        markdown = table.to_markdown(index=False, disable_numparse=True)
+        heading = f"{title}\n\n**{note}**" if note else title
+        write_text(path.with_suffix(".md"), f"{heading}\n\n{markdown}\n")
+        # LaTeX escapes the texts; signs that need mathematics follow.
+        caption = f"{title.rstrip('.')}. {note}".rstrip(". ")
+        caption = caption.replace("_", r"\_").replace("%", r"\%")
+        is_long = len(table) > PAGE_ROWS
+        latex = table.to_latex(index=False, escape=True, caption=caption, longtable=is_long)
+        for sign, command in LATEX_SIGNS.items():
+            latex = latex.replace(sign, command)
+        write_text(path.with_suffix(".tex"), latex)
         parts += [f"<h3>{escape(title)}</h3>", table.to_html(index=False, border=0)]
-    write_text(path, PAGE.format("\n".join(parts)))
+    write_text(page, PAGE.format("\n".join(parts)))

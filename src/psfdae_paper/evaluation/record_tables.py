@@ -1,8 +1,8 @@
 """Comparison of all tables of two runs: rows by their keys, values by their scatter.
 
-Inputs: tables as CSV in the folders of two runs. Outputs: a verdict on each value. Each table of
-the run of record has its keys here, and the standard error of each value. Times and memory belong
-to a machine, and are not compared.
+Inputs: tables as CSV in the folders of two runs. Outputs: a verdict on each value. The file
+record_tables.yaml has the keys of each table of the run of record, and the standard errors of its
+values. Times and memory belong to a machine, and are not compared.
 """
 
 from __future__ import annotations
@@ -16,122 +16,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from pandas.errors import UndefinedVariableError
 
-from psfdae.base.reading import read_table
+from psfdae.base.reading import read_table, read_yaml
 from psfdae_paper.evaluation.comparison import SIGNIFICANT
 
 Scatter = Mapping[str, str | float]
 """Standard error of a value by the name of its column, or a pattern of names: an expression of the
 table's columns, or a fraction of the value. Texts must be equal."""
 
-DIGITS, FIT, ROUNDING = 1e-3, 0.05, 0.2
-"""Fractions by which values scatter: computed without random numbers; of a training or a draw of
-stars; and of errors near the rounding of the processor, which have the same order of magnitude."""
+TABLES: dict[str, dict[str, Any]] = read_yaml(Path(__file__).with_suffix(".yaml"))["tables"]
+"""Keys of the rows of a table, and scatter of its values, by a pattern of file names."""
 
-ABSOLUTE = "0.01"
-"""Standard error of fractions and correlations, which may be near 0 or 1."""
-
-STARS = "dataset split reference noise_level method metric"
-TABLES: dict[str, tuple[str, Scatter]] = {
-    # Methods on test stars.
-    "*/psf_metrics.csv": (STARS, {"value": FIT, "stderr": FIT}),
-    "tables/psf_optics.csv": (STARS, {"value": "stderr"}),
-    "tables/psf_held_out.csv": ("dataset reference method noise_level", {"ratio": "stderr"}),
-    "tables/dataset?_*.csv": ("source reference method", {"*": FIT}),
-    "tables/seed_scatter.csv": ("dataset reference method", {"scatter": ROUNDING}),
-    # Bounds.
-    "tables/psf_bounds.csv": (STARS, {"value": "stderr", "median": FIT, "tight": 0, "found": 0}),
-    "tables/psf_bounds_growth.csv": (
-        "dataset reference method noise_level draws",
-        {"mse": FIT, "limit": FIT, "last_change": FIT},
-    ),
-    "tables/psf_efficiency.csv": (
-        "dataset reference noise_level method bound",
-        {"difference": "stderr", "mse": FIT, "mse_bound": FIT, "efficiency": FIT, "verdict": 0},
-    ),
-    "tables/paper_rows.csv": (
-        "dataset method noise_level",
-        {"mse_paper": 0, "mse_bound": "stderr", "mse": FIT, "verdict": 0},
-    ),
-    # Scene 3.
-    "tables/alignment_errors.csv": (
-        "test_set noise_level method parameter unit",
-        {
-            # Of the states and of the training, which was not repeated with other seeds.
-            "mean_abs_error": "sqrt(variance_abs / n + (0.05 * mean_abs_error) ** 2)",
-            "bias": "sqrt(variance / n + (0.05 * mean_abs_error) ** 2)",
-            "variance": "variance * sqrt(2 / n + 0.01)",
-        },
-    ),
-    "tables/alignment_correlation.csv": (
-        "test_set noise_level method parameter_a parameter_b",
-        {"correlation": "(ci_high - ci_low) / 3.92"},
-    ),
-    "tables/alignment_paper_correlation.csv": (
-        "source test_set noise_level method",
-        {"*": ABSOLUTE},
-    ),
-    "tables/alignment_paper_*.csv": ("source test_set method quantity", {"*": FIT}),
-    "tables/alignment_telescope.csv": ("quantity unit", {"value": DIGITS}),
-    "tables/alignment_twin.csv": ("noise_level defocus_mm position", {"chi2": FIT}),
-    "tables/alignment_time.csv": ("method", {"states": 0}),
-    # Models on images.
-    "tables/from_stars_selection.csv": ("id", {"x": 0.02, "y": 0.02, "snr": FIT, "verdict": 0}),
-    "tables/from_stars.csv": (
-        "snr method",
-        {"mse": "mse_stderr", "ssim": ABSOLUTE},
-    ),
-    "tables/predict_coverage.csv": (
-        "bundle method noise_level pixels",
-        {"coverage*": ABSOLUTE},
-    ),
-    "tables/predict_poppy.csv": (
-        "bundle method noise_level",
-        {
-            "mse_given": "stderr_given",
-            "mse_estimated": "stderr_estimated",
-            "mse_table": FIT,
-            "coverage*": ABSOLUTE,
-            "met": 0,
-        },
-    ),
-    "tables/predict_strange.csv": (
-        "noise_level kind measure",
-        {"found": "sqrt((found * (1 - found) + 0.01) / stars)"},
-    ),
-    "tables/predict_throughput.csv": ("stamps stamp_px threads", {"met": 0}),
-    # Stress tests.
-    "tables/stability.csv": ("case quantity", {"measured": ROUNDING, "verdict": 0}),
-    "tables/stability_graded.csv": ("case stress", {"error": ROUNDING, "bound": DIGITS}),
-    # Calibration.
-    "calibration/fit.csv": ("quantity unit", {"fitted": DIGITS, "configured": 0}),
-    "calibration/columns.csv": ("dataset noise_level", {"fitted": 0, "*": DIGITS}),
-    "calibration/degeneracy.csv": ("r0_m", {"*": DIGITS}),
-    "calibration/scales.csv": ("experiment r0_m pixel_scale_arcsec", {"*": DIGITS}),
-    # Benchmarks: their errors.
-    "tables/benchmark_convergence.csv": (
-        "scene aberration samples points",
-        {"mse": ROUNDING, "budget": DIGITS},
-    ),
-    "tables/benchmark_costs.csv": ("dataset method point settings", {"mse": FIT}),
-    "tables/benchmark_propagation.csv": (
-        "scene aberration method samples points precision backend threads batch processes",
-        {"mse": ROUNDING, "error_peak": ROUNDING, "within_budget": 0},
-    ),
-    "tables/benchmark_peers.csv": (
-        "scene aberration method samples points precision threads processes",
-        {"mse": ROUNDING, "within_budget": 0},
-    ),
-    "tables/benchmark_scaling.csv": ("what against stars stamp_px", {"disk_mb": ROUNDING}),
-    "tables/scaling_stages.csv": ("stage stars epochs", {"disk_mb": ROUNDING}),
-    "tables/benchmark_inference.csv": ("width stamp_px threads batch", {}),
-    "tables/benchmark_machine.csv": ("scene item", {}),
-    "runtime.csv": ("rule wildcards", {}),
-    # Sweeps.
-    "sweeps/*/summary.csv": ("point", {"status": 0, "validation_*": FIT, "test_*": FIT}),
-    "sweeps/*/cost.csv": ("point", {}),
-}
-"""Columns that are the keys of the rows of a table, separated by spaces, and scatter of values."""
+FIT = 0.05
+"""Fraction by which a value scatters that depends on a training or a draw of stars."""
 
 MACHINE = re.compile(r"(.*_)?(s|ms|mb|seconds|time|speedup)(_.*)?")
 """Columns of tables without an entry that are times or memory."""
@@ -155,9 +53,9 @@ def find_rule(name: str, table: pd.DataFrame) -> tuple[list[str], Scatter]:
         The table as texts. Without an entry in `TABLES`, texts and noise levels are its keys, and
         all other values scatter as of a fit, except times and memory.
     """
-    for pattern, (keys, scatter) in TABLES.items():
+    for pattern, rule in TABLES.items():
         if fnmatch(name, pattern):
-            return keys.split(), scatter
+            return rule["row"], rule["scatter"]
     numbers = _to_numbers(table)
     text_columns = [c for c in table.columns if c == "noise_level" or numbers[c].isna().all()]
     values = [c for c in table.columns.difference(text_columns) if not MACHINE.fullmatch(c)]
@@ -239,7 +137,10 @@ def _compute_scatter(rows: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
     sigmas = {}
     for column in rows.columns:
         rule = next((s for pattern, s in scatter.items() if fnmatch(column, pattern)), 0)
-        sigma = numbers.eval(rule) if isinstance(rule, str) else rule * numbers[column]
+        try:
+            sigma = numbers.eval(rule) if isinstance(rule, str) else rule * numbers[column]
+        except UndefinedVariableError:  # tables of other versions lack columns
+            sigma = np.nan
         # A value without its own standard error scatters as of a fit.
         sigmas[column] = pd.Series(sigma, rows.index).fillna(FIT * numbers[column]).fillna(0.0)
     return pd.DataFrame(sigmas, rows.index)

@@ -37,7 +37,15 @@ from psfdae.methods.fit_files import store
 from psfdae.methods.interface import CONFIG, HISTORY, TrainingSet
 from psfdae.stars.noise import draw_levels
 from psfdae.training.star_sets import noise_model
+from psfdae_paper.alignment.emulator import StampEmulator
+from psfdae_paper.alignment.likelihood import (
+    StateLikelihood,
+    StateOptics,
+    compute_bounds,
+    refit_twins,
+)
 from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.alignment.telescope import mirror_symmetries
 from psfdae_paper.configuration.alignment import NETWORKS, Alignment, NetworkTrain
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.estimators import (
@@ -334,7 +342,6 @@ def load_predictor(
 
     from psfdae.methods.networks.weights import load_network
     from psfdae_paper.alignment.networks import make_network, predict_states
-    from psfdae_paper.alignment.telescope import mirror_symmetries
 
     # The configuration in the folder must agree with the stamps.
     path = folder / CONFIG
@@ -526,9 +533,6 @@ def fit_alignment_method(
     times : Path
         CSV that receives the run time.
     """
-    from psfdae_paper.alignment.emulator import StampEmulator
-    from psfdae_paper.alignment.likelihood import StateLikelihood, StateOptics, refit_twins
-
     limit_threads(1)
     # States to fit, states for the emulator, the model of the wavefront, and the network.
     product, large_product = read_states(states, config), read_states(train, config)
@@ -620,8 +624,6 @@ def bound(
     out : Path
         HDF5 product with Cramér-Rao bounds.
     """
-    from psfdae_paper.alignment.likelihood import StateOptics, compute_bounds
-
     limit_threads(1)
     # States, the model of their wavefronts, and the noise.
     product = read_states(states, config)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple, TypedDict
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -48,39 +48,12 @@ ErrorTable = Annotated[File, "CSV of `alignment tables`."]
 Png = Annotated[File, "PNG."]
 
 
-class Key(TypedDict):
-    """Test set, noise level and method of some errors."""
-
-    test_set: str
-    noise_level: float
-    method: str
-
-
-class MethodResult(NamedTuple):
-    """Result of a method, or of a bound, at one noise level.
-
-    Attributes
-    ----------
-    key : Key
-        Test set, noise level and method.
-    truth : ndarray, shape (n, 4)
-        True states, in units of the range.
-    values : ndarray, shape (n, 4) or (n, 4, 4)
-        Estimated states or, of a bound, covariances of unbiased estimates.
-    is_bound : bool
-        Whether `values` are covariances of a bound.
-    """
-
-    key: Key
-    truth: np.ndarray
-    values: np.ndarray
-    is_bound: bool
-
-
 def read_results(
     estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
-) -> Iterator[MethodResult]:
+) -> Iterator[tuple[dict[str, Any], np.ndarray, np.ndarray, bool]]:
     """Read the results of all methods and noise levels, from products of one test.
+
+    There is one result for each method and noise level, in the order of the products.
 
     Parameters
     ----------
@@ -89,8 +62,14 @@ def read_results(
 
     Yields
     ------
-    MethodResult
-        One for each method and noise level, in the order of the products.
+    key : dict
+        test_set, noise_level and method.
+    truth : ndarray, shape (n, 4)
+        True states, in units of the range.
+    values : ndarray, shape (n, 4) or (n, 4, 4)
+        Estimated states or, of a bound, covariances of unbiased estimates.
+    is_bound : bool
+        Whether `values` are covariances of a bound.
 
     Raises
     ------
@@ -99,25 +78,23 @@ def read_results(
     """
     for product in read_products(estimates, fits, bounds):
         truth, test_set = product["states"], product.config["test_set"]
-        # A bound has covariances instead of estimates.
-        is_bound = product.kind == "alignment_bound"
-        # Names of the methods, and their values as an array [λ, method, state, ...].
-        if is_bound:
-            estimators = list_estimators("bound", test_set)
-            levels, values = product["levels"], product["covariances"].swapaxes(0, 1)
-        elif product.kind == "alignment_fit":
+        kind = product.kind.removeprefix("alignment_")
+        names = [estimator.name for estimator in list_estimators(kind, test_set)]
+        # Noise levels, and results as an array [λ, method, state, ...].
+        if kind == "bound":
+            levels, results = product["levels"], product["covariances"].swapaxes(0, 1)
+        elif kind == "fit":
             # A product of maximum-likelihood fits has one noise level.
-            estimators = list_estimators("fit", test_set)
-            levels, values = np.array([product.config["level"]]), product["estimates"][None]
+            levels, results = np.array([product.config["level"]]), product["estimates"][None]
         else:
             # The networks, and the constant estimate of the aligned telescope, which is 0.
-            estimators = [ESTIMATORS["constant"], *list_estimators("estimates", test_set)]
+            names = ["constant", *names]
             levels = product["levels"]
-            values = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
-        for level, by_method in zip(levels, values, strict=True):
-            for estimator, of_method in zip(estimators, by_method, strict=True):
-                key = Key(test_set=test_set, noise_level=float(level), method=estimator.name)
-                yield MethodResult(key, truth, of_method, is_bound)
+            results = np.pad(product["estimates"], ((0, 0), (1, 0), (0, 0), (0, 0)))
+        for level, by_method in zip(levels, results, strict=True):
+            for name, values in zip(names, by_method, strict=True):
+                key = {"test_set": test_set, "noise_level": float(level), "method": name}
+                yield key, truth, values, kind == "bound"
 
 
 def read_products(
@@ -151,34 +128,16 @@ def read_products(
             for reference in products:
                 require(path, product.config, keys, reference.config, reference.path)
                 if product.config["test_set"] == reference.config["test_set"]:
-                    _require_states(product, reference)
+                    states, truth = _name_states(product), _name_states(reference)
+                    require(path, states, tuple(states), truth, reference.path)
             products.append(product)
     return products
 
 
-def _require_states(product: Product, reference: Product) -> None:
-    """Require that two products of one test set have the same true states.
-
-    Parameters
-    ----------
-    product, reference : Product
-        Products with the column `states`, (n, 4); messages name the first as wrong.
-
-    Raises
-    ------
-    ProductError
-        With the number of states, or the first state that differs.
-    """
-    states, truth = product["states"], reference["states"]
-    if np.array_equal(states, truth):
-        return
-    difference = f"number of states = {len(states)}, but {reference.path} has {len(truth)}"
-    if len(states) == len(truth):
-        row = int((states != truth).any(axis=1).argmax())
-        difference = (
-            f"state {row} = {states[row].tolist()}, but {reference.path} has {truth[row].tolist()}"
-        )
-    raise ProductError(f"{product.path}: {difference}")
+def _name_states(product: Product) -> dict[str, object]:
+    """Return the number of a product's true states, and each state by its number, for messages."""
+    states = product["states"].tolist()
+    return {"number of states": len(states)} | {f"state {i}": s for i, s in enumerate(states)}
 
 
 @command("paper alignment tables")
@@ -235,15 +194,11 @@ def tables(
             if key["method"] != "constant":
                 correlation_rows += alignment_tables.tabulate_error_correlations(key, error)
     # Rows by test set, noise level, and the order in which methods are listed.
-    method_order = list(ESTIMATORS)
     for path, rows in ((errors, error_rows), (correlation, correlation_rows)):
+        frame = pd.DataFrame(rows)
+        frame["method"] = pd.Categorical(frame["method"], list(ESTIMATORS))
         # A stable sort keeps the order of the parameters.
-        frame = pd.DataFrame(rows).sort_values(
-            ["test_set", "noise_level", "method"],
-            key=lambda c: c.map(method_order.index) if c.name == "method" else c,
-            kind="stable",
-        )
-        write_csv(path, frame)
+        write_csv(path, frame.sort_values(["test_set", "noise_level", "method"], kind="stable"))
 
 
 @command("paper alignment paper-tables")
@@ -275,14 +230,12 @@ def alignment_paper_tables(
         "Test set grid: the very states that the networks were trained on, with new noise; "
         "uniform: other states of the same range."
     )
-    texts = []
+    texts = {}
 
-    def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
-        path, title = out / f"alignment_paper_{name}.csv", f"{title}. {test_sets}"
+    def add(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
+        path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
-        text_table = alignment_tables.format_table(table, digits)
-        readable.write_readable(path, text_table, title, note)
-        texts.append((title, text_table))
+        texts[path] = f"{title}. {test_sets}", alignment_tables.format_table(table, digits)
 
     # One table of errors for each of the paper's noise levels.
     error_table = read_table(errors)
@@ -292,11 +245,11 @@ def alignment_paper_tables(
         # Mean and variance of the absolute errors, as in the paper.
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
-        write(f"{level:g}", alignment_tables.compare_errors(error_table, level), title, digits)
+        add(f"{level:g}", alignment_tables.compare_errors(error_table, level), title, digits)
     # Correlations of signed errors between pairs of parameters.
     table = alignment_tables.compare_correlations(read_table(correlation))
-    write("correlation", table, "Correlations of signed errors", {"": ".3f"})
-    readable.write_page(page, texts, note)
+    add("correlation", table, "Correlations of signed errors", {"": ".3f"})
+    readable.write_tables(texts, page, note)
 
 
 @command("paper alignment time-table")
@@ -404,18 +357,14 @@ def figure_errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) ->
     the range. The bound assumes normal errors, whose mean modulus is σ √(2/π).
     """
     # Mean error of the four numbers of each state, measured and of an unbiased estimate.
-    curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
+    curves: dict[float, dict[str, np.ndarray]] = defaultdict(dict)
     for key, truth, values, is_bound in read_results(estimates, fits, bounds):
         is_shown = ESTIMATORS[key["method"]].is_drawn or key["method"] == "cramer_rao"
         if key["noise_level"] > 0 and is_shown:
             # A bound gives the variance: E|x| = σ √(2/π) for a normal error.
             error = compute_mean_abs_error(values) if is_bound else np.abs(values - truth)
-            curves[key["noise_level"]][key["method"]] = (
-                alignment_figures.compute_size(truth),
-                error.mean(axis=1),
-            )
-    title = f"Errors against misalignment, {len(truth)} uniform states"
-    write_png(alignment_figures.draw_errors_by_size(curves, title), out)
+            curves[key["noise_level"]][key["method"]] = error.mean(axis=1)
+    write_png(alignment_figures.draw_errors_by_size(truth, curves), out)
 
 
 @command(
@@ -545,7 +494,7 @@ def figure_correlation(correlation: ErrorTable, out: Png, note: Note = "") -> No
         panels += [upper, [panel(method, rows) for method in not_in_paper]]
     # Intervals of all drawn correlations but those of a number with itself; the Fisher matrix
     # predicts without scatter.
-    is_measured = table.method.isin([x.name for x in methods if x.name != "cramer_rao"])
-    measured = table[is_measured & (table.parameter_a != table.parameter_b)]
-    half_width = float((0.5 * (measured.ci_high - measured.ci_low)).max())
+    has_interval = table.method.isin([x.name for x in methods if x.name != "cramer_rao"])
+    has_interval &= table.parameter_a != table.parameter_b
+    half_width = float(0.5 * (table.ci_high - table.ci_low)[has_interval].max())
     write_png(alignment_figures.draw_correlations(panels, half_width, note), out)

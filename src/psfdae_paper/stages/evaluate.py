@@ -271,16 +271,14 @@ def paper_tables(
         How the run differs from the paper's.
     """
     measured_rows = read_tables(evaluations, MeasuredStars.columns)
-    tables = []
+    tables = {}
     for metric, path in out:
         # Numbers for programs, texts for readers.
         table = paper_table(measured_rows, dataset, metric)
         write_csv(path, table, 6)
-        text_table = format_paper_table(table, metric)
         title = f"{metric.upper()} of {dataset}, split random"
-        readable.write_readable(path, text_table, title, note)
-        tables.append((title, text_table))
-    readable.write_page(page, tables, note)
+        tables[path] = title, format_paper_table(table, metric)
+    readable.write_tables(tables, page, note)
 
 
 @command("paper methods-table")
@@ -307,11 +305,9 @@ def methods_table(
     note : str
         How the run differs from the paper's.
     """
-    rows, tables = read_table(metrics, *MeasuredStars.columns[:-1], "seed_stderr"), []
-    units = {"mse": "MSE × 10⁶", "ssim": "SSIM"}
+    rows = read_table(metrics, *MeasuredStars.columns[:-1], "seed_stderr")
+    units, tables = {"mse": "MSE × 10⁶", "ssim": "SSIM"}, {}
     for metric, path in out:
-        table = readable.tabulate_methods(rows, metric)
         title = f"{units[metric]} of all methods, ± standard error"
-        readable.write_readable(path, table, title, note)
-        tables.append((title, table))
-    readable.write_page(page, tables, note)
+        tables[path] = title, readable.tabulate_methods(rows, metric)
+    readable.write_tables(tables, page, note)

@@ -19,21 +19,19 @@ from collections.abc import Iterable
 from datetime import date
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 
 from psfdae.base.files import ProductError, write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.source import cpu_model, git
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from psfdae_paper.configuration.schema import Config
 
 MAY_STAY = re.compile(r"(sweeps|paper)/.+")
 """Names of products that may stay from an earlier record, because they take too long."""
@@ -68,8 +66,6 @@ def read_job_costs(results: Path) -> pd.DataFrame:
     results : Path
         Folder of a run, with the folders `benchmarks` and `logs`.
     """
-    import pandas as pd
-
     # A table of Snakemake for each job: RULE/WILDCARDS.tsv.
     folder = results / "benchmarks"
     rows = []
@@ -117,8 +113,6 @@ def reference(
     plans : sequence of Path
         Output of `snakemake --summary` for the files of the record.
     """
-    from psfdae_paper.configuration.compose import load
-
     # The commit must be complete, and all files up to date with it.
     commit = clean_commit()
     new_names = list_current_files(results, plans)

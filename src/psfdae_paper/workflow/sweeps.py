@@ -8,6 +8,7 @@ from psfdae.methods import method
 from psfdae_paper.configuration.estimators import list_swept_networks
 from psfdae_paper.configuration.sweep import find_sweeps
 from psfdae_paper.source import source_hash
+from psfdae_paper.stages.sweep import training_module
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
 from psfdae_paper.workflow.datasets import stars_file
 from psfdae_paper.workflow.run import Run, Wildcards, exit_in_one_line
@@ -72,8 +73,6 @@ def point_threads(run: Run, wildcards: Wildcards) -> int:
 @cache
 def sweep_code(run: Run, name: str) -> str:
     """Return the hash of a point's code: its model's, and the search's of an adaptive sweep."""
-    from psfdae_paper.stages.sweep import training_module
-
     sweep = sweep_plan(run, name).sweep
     # Only adaptive values depend on the code of the search.
     search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from fnmatch import fnmatch
 from itertools import combinations, product
@@ -224,6 +225,21 @@ def test_tables_within_their_scatter_are_not_named(tmp_path):
     _, output = list_differing(run)
     assert "alignment_errors.csv**: 0 of 999 values" in output
     assert "3 rows are in one alone" in output and "Not in A: tables/stability.csv" in output
+
+
+def test_tables_are_compared_that_lack_a_column_of_a_standard_error(tmp_path):
+    """Each column that an expression names; values without it scatter as of a fit."""
+    lacking = []
+    for name in record_tables.list_tables(RECORD):
+        table = pd.read_csv(RECORD / name, dtype=str, keep_default_na=False)
+        keys, scatter = record_tables.find_rule(name, table)
+        expressions = " ".join(rule for rule in scatter.values() if isinstance(rule, str))
+        for column in {*re.findall(r"[a-z]\w*", expressions)} & {*table.columns} - {*keys}:
+            write_text(tmp_path / name, table.drop(columns=column).to_csv(index=False))
+            values = record_tables.compare_values(tmp_path, RECORD, name)
+            assert set(values.verdict) <= {"equal"} and column not in set(values.column)
+            lacking.append(column)
+    assert {"n", "variance", "stderr", "mse_stderr", "ci_low", "stars"} <= {*lacking}
 
 
 def test_a_table_without_an_entry_is_compared_by_its_texts(tmp_path):

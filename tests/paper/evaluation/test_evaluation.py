@@ -124,11 +124,11 @@ def test_methods_stand_side_by_side_with_their_errors_and_the_paper(tmp_path):
     assert float(random["DAE, paper"]) == pytest.approx(1e6 * row.value, rel=1e-3)
     # The paper has no held-out fields.
     assert held_out["DAE, paper"] == ""
-    readable.write_readable(tmp_path / "t.md", table, "Errors", "Not the paper's data")
+    tables = {tmp_path / "t.csv": ("a < b", table)}
+    readable.write_tables(tables, tmp_path / "t.html", "Not the paper's data")
     assert "**Not the paper's data**" in (tmp_path / "t.md").read_text()
     latex = (tmp_path / "t.tex").read_text()
     assert r"100.000 $\pm$ 0.030" in latex and r"held\_out" in latex and latex.isascii()
-    readable.write_page(tmp_path / "t.html", [("a < b", table)], "Not the paper's data")
     page = (tmp_path / "t.html").read_text()
     assert page.count("<td>") == table.size and "a &lt; b" in page
 

@@ -56,11 +56,10 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     paper["method"] = paper["method"].map(read_paper_names())
     # One row per source, reference and method, in the order of the configuration.
     rows = pd.concat([paper, measured_rows], ignore_index=True)
-    rows["order"] = rows["method"].map({method: i for i, method in enumerate(labels)})
-    table = rows.pivot(
-        index=["source", "reference", "order", "method"], columns="noise_level", values="value"
-    )
-    table = table.reset_index().drop(columns="order")
+    rows["method"] = pd.Categorical(rows["method"], list(labels))
+    keys = ["source", "reference", "method"]
+    table = rows.pivot(index=keys, columns="noise_level", values="value").sort_index().reset_index()
+    table["method"] = table["method"].astype(object)
     # Labels of the methods, with their inputs; columns of noise levels as text.
     inputs = table["method"].map({m.name: str(m.needs) for m in list_methods()})
     table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
@@ -71,8 +70,5 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
 def format_paper_table(table: pd.DataFrame, metric: str) -> pd.DataFrame:
     """Return a table of `paper_table` as texts, MSE in scientific notation."""
     digits = ".4e" if metric == "mse" else ".4f"
-    text_table = table.copy()
-    for column in text_table.columns[3:]:
-        text_table[column] = text_table[column].map(lambda value: format(value, digits))
-    text_table.columns = [*text_table.columns[:3], *(f"λ = {c}" for c in text_table.columns[3:])]
-    return text_table
+    numbers = table.iloc[:, 3:].map(lambda value: format(value, digits)).add_prefix("λ = ")
+    return pd.concat([table.iloc[:, :3], numbers], axis=1)
