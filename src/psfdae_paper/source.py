@@ -181,8 +181,6 @@ def cpu_model() -> str:
     """Return the model of the processor as the operating system names it."""
     # A file of Linux; elsewhere Python asks the system.
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return [*models, platform.processor() or platform.machine()][0]

@@ -95,7 +95,7 @@ def simulate_fresh_stars(config, count):
     field = assign_fields(count, config.grid.points**2, fields)
     jitter = draw_jitter(count, config.framing.jitter_px, jitter)
     kernel = propagation(config, star_wavefronts(config, field))
-    return normalise_flux(kernel.framed(config.framing.stamp_px, jitter)[0])[0]
+    return normalise_flux(kernel.frame(config.framing.stamp_px, jitter)[0])[0]
 
 
 def simulated(config, folder):

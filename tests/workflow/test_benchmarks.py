@@ -53,7 +53,7 @@ def test_configured_optics_stay_within_the_error_budget(dataset, worst_stars):
     """Datasets whose stars must fit the least noise; `screen` finds their worst stars."""
     scene = scenes.Scene.of(load_stage(scenes.READS, [f"dataset={dataset}"]))
     selection = scenes.Selection(scene.stars, np.array(worst_stars))
-    stamps, offset = scene.propagation(selection, scene.search_px).framed(scene.framing.stamp_px)
+    stamps, offset = scene.propagation(selection, scene.search_px).frame(scene.framing.stamp_px)
     exact = scenes.stamps_at(scene, selection, offset, *scenes.REFERENCES[-1])
     assert scenes.stamp_mse(normalise_flux(stamps)[0], exact).max() <= scene.budget
 

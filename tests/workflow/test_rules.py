@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from psfdae.base.files import write_text
+from psfdae_paper.configuration.experiment import list_experiments, load_experiment
 from psfdae_paper.source import git_commit
 from psfdae_paper.workflow import alignment, datasets, fits, night, report, run, sweeps
 from psfdae_paper.workflow.run import (
@@ -104,6 +105,23 @@ def test_differences_from_the_paper_are_named(words, data, training):
     assert ("ot the paper's training" in line) == bool(training)
     warnings = [text for text in report.list_warnings(run) if "dataset3" in text.partition(":")[0]]
     assert [text.partition(": ")[2] for text in warnings] == ([line] if data or training else [])
+
+
+@pytest.mark.parametrize("name", list_experiments())
+def test_differences_of_a_variant_are_those_of_its_setting(name):
+    """A variant is compared with the paper's settings of its dataset."""
+    experiment = load_experiment(name)
+    run = read_run({"name": name})
+    variants = [v for v in run.variants if v.dataset == experiment.datasets[0]]
+    for variant in [v for v in variants if v.seed == experiment.seeds[-1]]:
+        line = report.describe_differences(run, variant.name)
+        texts = [*report.find_differences(run, variant.name)["data"]]
+        keys = [*(experiment.settings[variant.setting] or {}), "seed"]
+        assert {*keys} <= {text.partition(" = ")[0] for text in texts}
+        assert line.startswith("Not the paper's data: ")
+        # Differences of the preset alone are those of the dataset.
+        base = report.find_differences(run, variant.dataset)
+        assert {*base["data"]} <= {*texts}
 
 
 def test_another_run_stops_in_a_folder_that_nobody_named(tmp_path, monkeypatch):

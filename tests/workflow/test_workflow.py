@@ -84,6 +84,16 @@ def test_figures_show_stars_that_the_tables_measure(smoke):
             assert np.isclose(errors[:, None], rows.mse.to_numpy(), rtol=1e-5).any(axis=1).all()
 
 
+def test_the_twin_is_nearest_in_focus_as_its_caption_says(smoke):
+    twins = pd.read_csv(smoke / "results/tables/alignment_twin.csv").query("position == -1")
+    own_defocus_mm = 1e3 * load(["dataset=alignment"]).alignment.defocus_m
+    assert twins.noise_level.nunique() > 1
+    for _, rows in twins.groupby("noise_level"):
+        assert rows.defocus_mm[rows.chi2.idxmin()] == 0
+        assert rows.defocus_mm.max() == pytest.approx(2 * own_defocus_mm)
+        assert own_defocus_mm in rows.defocus_mm.round(9).to_list()
+
+
 def test_the_page_of_the_scenes_describes_their_files(smoke):
     """Arrays, their types, units and meanings; the page adds words in brackets."""
     tables = re.split(r"^`(\w+)` \(", read("docs/scenes.md"), flags=re.M)[1:]

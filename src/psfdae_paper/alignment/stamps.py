@@ -180,10 +180,8 @@ class AlignmentStamps:
         if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
         # Flatten the leading axes to one list of wavefronts.
-        zernikes, directions = (
-            array.reshape(prod(shape), *array.shape[len(shape) :])
-            for array in (zernikes, directions)
-        )
+        zernikes = zernikes.reshape(prod(shape), -1)
+        directions = directions.reshape(prod(shape), *directions.shape[len(shape) :])
         # The flux of a stamp depends on the state, too: the quotient is differentiated.
         raw = self.propagation.derivatives(zernikes, directions, by_position=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)

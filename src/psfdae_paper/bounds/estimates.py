@@ -22,6 +22,8 @@ from psfdae_paper.bounds.posterior import (
     average_nested,
     cut_templates,
     group_by_field,
+    list_jitters,
+    merge,
     sum_posterior,
 )
 from psfdae_paper.bounds.sampling import SampledPosterior, sample_posterior
@@ -215,7 +217,7 @@ def simulate_fresh_stars(
     propagation = Propagation(source, config.telescope, optics, framing, config.stars.search_px)
     # Framed without centring error, with a margin from which all errors and mirror images are cut.
     margin = framing.jitter_px + Bank.mirror_margin
-    frames, peak = propagation.framed(framing.stamp_px + 2 * margin)
+    frames, peak = propagation.frame(framing.stamp_px + 2 * margin)
     return {
         "framed": Column(
             frames.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
@@ -234,7 +236,7 @@ def propagate_static_psfs(config: Config) -> np.ndarray:
         template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
     )
     # Framed with a margin of the largest centring error; then cut at every error.
-    frames, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
+    frames, _ = propagation.frame(framing.stamp_px + 2 * framing.jitter_px)
     return cut_templates(frames.astype(np.float32), framing.jitter_px)
 
 
@@ -351,6 +353,45 @@ def weigh_bank(
             draws = round(len(bank) / pieces * size)
             measures.setdefault(draws, np.empty((len(values), stars.star.size)))[:, group] = values
     return measures
+
+
+def sum_over_bank(
+    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, star_field: np.ndarray | None
+) -> PosteriorSums:
+    """Sum over an eighth of a bank, and over all of it where this is likely to be enough.
+
+    Parameters
+    ----------
+    bank : Bank
+        Simulated stars, samples of the prior.
+    noisy : ndarray, shape (n, d, d)
+        Noisy stars.
+    likelihood : Likelihood
+        Likelihood at their noise level.
+    star_field : ndarray of int, shape (n,), or None
+        Number of each star's field, if it is known.
+    """
+    shifts = len(list_jitters(bank.jitter_px))
+    sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
+
+    def weigh(stars: np.ndarray, bank_stars: np.ndarray) -> PosteriorSums:
+        field = None if star_field is None else star_field[stars]
+        return sum_posterior(bank.take(bank_stars), noisy[stars], likelihood, star_field=field)
+
+    # Stars whose field is known are compared with the bank's stars of this field and of its mirror
+    # images.
+    for stars, bank_stars in group_by_field(len(noisy), star_field, bank):
+        eighth = len(bank_stars) // 8
+        first_sums = weigh(stars, bank_stars[:eighth])
+        sums.put(stars, first_sums)
+        # The effective sample size grows in proportion to the bank: the whole bank is used for
+        # stars with too few samples of an eighth of it, and enough of all of it.
+        size = first_sums.effective_size
+        promising = (size < ENOUGH_ESS) & (8 * size >= ENOUGH_ESS)
+        if promising.any():
+            further_sums = weigh(stars[promising], bank_stars[eighth:])
+            sums.put(stars[promising], merge([first_sums.select(promising), further_sums]))
+    return sums
 
 
 def measure_posteriors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:

@@ -105,7 +105,7 @@ class FreshStars:
             # Static PSFs: nothing of a star is random but its field, centring error and noise.
             source = template_wavefronts(config)
             optics = (config.telescope, config.optics, framing, framing.search_px)
-            frames = Propagation(source, *optics).framed(framing.stamp_px + 2 * margin)[0]
+            frames = Propagation(source, *optics).frame(framing.stamp_px + 2 * margin)[0]
             field = np.arange(len(frames))
             times = np.ones((len(frames), 1), int)
         # Mirrored stars are at mirrored fields, which may be left out.

@@ -96,11 +96,7 @@ class Tables:
             Further columns.
         """
         # Columns that all metrics share.
-        key: dict[str, object] = {
-            "dataset": self.dataset,
-            "split": SPLIT,
-            "reference": reference,
-        }
+        key: dict[str, object] = {"dataset": self.dataset, "split": SPLIT, "reference": reference}
         key |= {"method": method, "noise_level": level}
         has_estimate = np.isfinite(values["mse"])
         field = self.stars.field[has_estimate]
@@ -157,27 +153,16 @@ class Tables:
             if not evidence.tight:
                 # Far from convergence the fit extrapolates to anything, down to zero.
                 limit = float("nan")
-            self.growth += [
-                {
-                    "dataset": self.dataset,
-                    "reference": reference,
-                    "method": method,
-                    "noise_level": level,
-                    "draws": count,
-                    "mse": error,
-                    "stderr": deviation,
-                    "n": self.stars.field.size,
-                    "ess_mean": values[-1].mean(),
-                    "ess_median": np.median(values[-1]),
-                    "last_change": evidence.last_change,
-                    "limit": limit,
-                    "exponent": exponent,
-                    "fit_rms": residual,
-                }
-                for count, error, deviation, values in zip(
-                    draws, errors, stderr, measures.values(), strict=True
-                )
-            ]
+            key = {"dataset": self.dataset, "reference": reference, "method": method}
+            key |= {"noise_level": level, "n": self.stars.field.size}
+            fit = {"limit": limit, "exponent": exponent, "fit_rms": residual}
+            fit |= {"last_change": evidence.last_change}
+            for count, error, sigma, values in zip(
+                draws, errors, stderr, measures.values(), strict=True
+            ):
+                size = {"draws": count, "mse": error, "stderr": sigma}
+                ess = {"ess_mean": values[-1].mean(), "ess_median": np.median(values[-1])}
+                self.growth.append({**key, **size, **ess, **fit})
 
 
 def add_floor(config: Config, product: Product, tables: Tables) -> None:

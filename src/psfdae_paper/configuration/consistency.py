@@ -54,9 +54,7 @@ class Consistent(Group):
         object
             The groups by `fill_derived_values`.
         """
-        if not isinstance(tree, Mapping):
-            return tree
-        return fill_derived_values(tree)
+        return fill_derived_values(tree) if isinstance(tree, Mapping) else tree
 
     @model_validator(mode="before")
     @classmethod
@@ -120,9 +118,7 @@ class Consistent(Group):
             )
         # In waves RMS; own telescopes alone have it.
         jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
-        if stars is None or not jitter:
-            return self
-        if stars.aberration_fraction == 0:
+        if jitter and stars is not None and stars.aberration_fraction == 0:
             raise ValueError(
                 f"telescope.aberrations.jitter_waves = {jitter}: "
                 "stars.aberration_fraction must be above 0, stars without random aberrations "

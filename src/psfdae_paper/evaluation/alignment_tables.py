@@ -105,18 +105,13 @@ def tabulate_correlations(
 
     `matrix` (4, 4) has the correlations, `low` and `high` (4, 4) the ends of their intervals.
     """
-    return [
-        {
-            **key,
-            "parameter_a": DEGREES_OF_FREEDOM[a],
-            "parameter_b": DEGREES_OF_FREEDOM[b],
-            "correlation": matrix[a, b],
-            "ci_low": low[a, b],
-            "ci_high": high[a, b],
-        }
-        # All ordered pairs, the diagonal included.
-        for a, b in product(range(4), repeat=2)
-    ]
+    rows: list[Row] = []
+    # All ordered pairs, the diagonal included.
+    for a, b in product(range(4), repeat=2):
+        pair = {"parameter_a": DEGREES_OF_FREEDOM[a], "parameter_b": DEGREES_OF_FREEDOM[b]}
+        interval = {"ci_low": low[a, b], "ci_high": high[a, b]}
+        rows.append({**key, **pair, "correlation": matrix[a, b], **interval})
+    return rows
 
 
 def tabulate_error_correlations(key: Key, errors: np.ndarray) -> list[Row]:

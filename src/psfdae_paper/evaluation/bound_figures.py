@@ -45,16 +45,15 @@ def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) ->
     Parameters
     ----------
     efficiency, bounds : DataFrame
-        Tables of the stages of these names.
+        Rows of the dataset in the tables of the stages of these names.
     dataset : str
-        Dataset whose rows are drawn; it is also in the title.
+        Name in the title.
     """
-    table = efficiency[efficiency.dataset == dataset]
-    limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
+    limits = bounds[bounds.metric == "mse"]
     figure, panels = drawing.make_panels(limits)
     for axes, reference, rows in panels:
         # The rows of each method are repeated for the floor, together with posterior means.
-        methods = table[(table.reference == reference) & (table.bound != "floor")]
+        methods = efficiency[(efficiency.reference == reference) & (efficiency.bound != "floor")]
         for method_class, errors in drawing.group_by_method(methods.sort_values("noise_level")):
             style = {**drawing.method_line(method_class), "capsize": 3}
             axes.errorbar(errors["noise_level"], errors["mse"], yerr=errors["stderr"], **style)
@@ -69,7 +68,7 @@ def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) ->
     if (limits["value"] == 0).any():
         first.set_ylim(bottom=0.5 * first.get_ylim()[0])
     # Legend; an open marker is explained if a posterior mean is not tight at some level.
-    handles = drawing.make_method_entries(set(table["method"]))
+    handles = drawing.make_method_entries(set(efficiency["method"]))
     for name, look in MEANS.items():
         tightness = set(limits["tight"][limits.method == name])
         if tightness:
@@ -87,12 +86,11 @@ def draw_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) ->
 def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """Draw bound over MSE of every method against the noise level, one panel per reference.
 
-    `efficiency` is the table of the stage of this name.
+    `efficiency` has the rows of the dataset in the table of the stage of this name.
     """
-    table = efficiency[efficiency.dataset == dataset]
     # The table also has posterior means, which are not methods.
     names = [method_class.name for method_class in list_methods()]
-    figure, panels = drawing.make_panels(table)
+    figure, panels = drawing.make_panels(efficiency)
     for axes, _, rows in panels:
         # Solid lines relative to the posterior mean, dotted lines relative to the floor.
         method_rows = rows[rows.method.isin(names)].sort_values("noise_level")
@@ -113,16 +111,16 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
     # An efficiency above 1 is noise, or the floor is too rough an approximation.
     panels[0][0].set_ylim(top=2.0)
     # Line styles of both bounds, as far as they are drawn.
-    handles = drawing.make_method_entries(set(table["method"]))
-    drawn_rows = table[table.method.isin(names)].dropna(subset=["efficiency"])
+    handles = drawing.make_method_entries(set(efficiency["method"]))
+    drawn_rows = efficiency[efficiency.method.isin(names)].dropna(subset=["efficiency"])
     is_floor = drawn_rows["bound"] == "floor"
     if (~is_floor).any():
-        handles.append(
-            drawing.make_entry("against the posterior mean, where tight", ls="-", lw=1.6)
-        )
+        label = "against the posterior mean, where tight"
+        handles.append(drawing.make_entry(label, ls="-", lw=1.6))
     if is_floor.any():
         handles.append(drawing.make_entry("against the local floor", ls=":", lw=1.6))
-    title = f"{dataset}: efficiency, 1 = no better is possible, n = {table['n'].max()} test stars"
+    count = efficiency["n"].max()
+    title = f"{dataset}: efficiency, 1 = no better is possible, n = {count} test stars"
     drawing.finish_panels(figure, panels, title, handles, 3, "efficiency: bound / MSE")
     return figure
 
@@ -131,12 +129,12 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
 def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """Draw the error of the posterior mean against the size of the bank.
 
-    `growth` is the growth table of the stage `bounds`; there is one panel per reference.
+    `growth` has the rows of the dataset in the growth table of the stage `bounds`; there is one
+    panel per reference.
     """
-    dataset_rows = growth[growth.dataset == dataset]
-    figure, panels = drawing.make_panels(dataset_rows)
+    figure, panels = drawing.make_panels(growth)
     # One colour for each noise level, the same in both panels.
-    levels = np.unique(dataset_rows["noise_level"])
+    levels = np.unique(growth["noise_level"])
     colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
     for axes, _, rows in panels:
         # Measured errors as lines with markers, the limit of the fit as a dashed line.
@@ -159,7 +157,7 @@ def draw_bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
         drawing.make_entry(**look | {"color": "black"}, ls="", ms=4.5) for look in MEANS.values()
     ]
     handles.append(drawing.make_entry("limit of the fit", ls="--", lw=1.0))
-    count = dataset_rows["n"].max()
+    count = growth["n"].max()
     title = f"{dataset}: the posterior mean over banks of growing size, n = {count} test stars"
     drawing.finish_panels(figure, panels, title, handles, 4)
     return figure

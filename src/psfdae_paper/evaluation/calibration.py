@@ -85,37 +85,25 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     """
     from scipy.optimize import least_squares
 
-    # Interpolated SSIM of each of the paper's columns, and the number of its experiment.
-    rows = _select_rows(scan)
-    experiments = sorted(scan.experiment.unique())
-    surfaces = [_interpolate_ssim(scan, row) for row in rows]
-    experiment_index = [
-        experiments.index(scan.experiment[scan.dataset == row.dataset].iloc[0]) for row in rows
-    ]
-    published_ssim = np.array([row.ssim for row in rows])
+    # Scanned pixel scales by experiment, and the number of the experiment of each dataset.
+    scales = scan.groupby("experiment").pixel_scale_arcsec.agg(["min", "max"])
+    experiments = scan.groupby("dataset").experiment.first()
+    numbers = {name: list(scales.index).index(value) for name, value in experiments.items()}
+    residuals = _interpolate_residuals(scan)
 
-    def residuals(logarithms: np.ndarray) -> np.ndarray:
+    def compute_residuals(logarithms: np.ndarray) -> np.ndarray:
         # SSIM of the interpolated scan minus the paper's, for each of its columns.
-        data_range, scales = np.exp(logarithms[0]), np.exp(logarithms[1:])
-        ssim = [
-            surface(scales[index], data_range)
-            for surface, index in zip(surfaces, experiment_index, strict=True)
-        ]
-        residual: np.ndarray = np.array(ssim) - published_ssim
-        return residual
+        data_range, *scale = np.exp(logarithms)
+        return np.array([f(scale[numbers[d]], data_range) for d, f in residuals])
 
     # Parameters are logarithms within the scanned ranges; the fit begins in their middle.
-    ranges = scan.data_range.agg(["min", "max"])
-    bounds = [(ranges["min"], ranges["max"])]
-    for experiment in experiments:
-        scales = scan.pixel_scale_arcsec[scan.experiment == experiment]
-        bounds.append((scales.min(), scales.max()))
-    low, high = np.log(np.array(bounds)).T
-    solution = least_squares(residuals, 0.5 * (low + high), bounds=(low, high), diff_step=1e-3)
+    low, high = np.log(np.vstack([scan.data_range.agg(["min", "max"]), scales])).T
+    middle = 0.5 * (low + high)
+    solution = least_squares(compute_residuals, middle, bounds=(low, high), diff_step=1e-3)
     # Back from logarithms: the range, then the scale of each experiment.
     data_range, *pixel_scales = (float(np.exp(logarithm)) for logarithm in solution.x)
     rms = float(np.sqrt(np.mean(solution.fun**2)))
-    return ScaleFit(data_range, dict(zip(experiments, pixel_scales, strict=True)), rms)
+    return ScaleFit(data_range, dict(zip(scales.index, pixel_scales, strict=True)), rms)
 
 
 def compute_scale_residuals(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
@@ -129,37 +117,34 @@ def compute_scale_residuals(scan: pd.DataFrame, data_range: float) -> pd.DataFra
     # RMS and largest difference of the SSIM over the paper's columns, at each scanned scale.
     table = []
     for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
-        rows = _select_rows(part)
-        surfaces = [_interpolate_ssim(part, row) for row in rows]
-        published_ssim = np.array([row.ssim for row in rows])
+        residuals = _interpolate_residuals(part)
         for scale in sorted(part.pixel_scale_arcsec.unique()):
-            ssim = np.array([surface(scale, data_range) for surface in surfaces])
-            residual = ssim - published_ssim
-            table.append(
-                (experiment, r0, scale, np.sqrt((residual**2).mean()), np.abs(residual).max())
-            )
-    return pd.DataFrame(
-        table, columns=["experiment", "r0_m", "pixel_scale_arcsec", "rms", "largest"]
-    )
+            residual = np.array([compute(scale, data_range) for _, compute in residuals])
+            statistics = np.sqrt((residual**2).mean()), np.abs(residual).max()
+            table.append((experiment, r0, scale, *statistics))
+    columns = ["experiment", "r0_m", "pixel_scale_arcsec", "rms", "largest"]
+    return pd.DataFrame(table, columns=columns)
 
 
-def _select_rows(scan: pd.DataFrame) -> list[OriginalNoise]:
-    """Return the paper's columns that are used in fits and are in a scan."""
-    # A scan may have the datasets of one experiment alone.
-    datasets = set(scan.dataset)
-    return [row for row in read_original_noise() if row.is_fitted and row.dataset in datasets]
+def _interpolate_residuals(scan: pd.DataFrame) -> list[tuple[str, Callable[[float, float], float]]]:
+    """Return the SSIM of a scan minus the paper's, for each of its columns in the scan.
 
-
-def _interpolate_ssim(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
-    """Interpolate the SSIM of one column as a function of pixel scale and dynamic range."""
+    Each has its dataset, and a function of pixel scale and dynamic range.
+    """
     from scipy.interpolate import RectBivariateSpline
 
-    # SSIM on the scanned grid: rows are pixel scales, columns are dynamic ranges.
-    part = scan[(scan.dataset == row.dataset) & np.isclose(scan.noise_level, row.noise_level)]
-    grid = part.pivot(index="pixel_scale_arcsec", columns="data_range", values="ssim")
-    # A spline through the scanned points in both logarithms, cubic if there are enough points.
-    order = [min(3, size - 1) for size in grid.shape]
-    spline = RectBivariateSpline(
-        np.log(grid.index), np.log(grid.columns), grid.to_numpy(), kx=order[0], ky=order[1]
-    )
-    return lambda scale, data_range: float(spline(np.log(scale), np.log(data_range))[0, 0])
+    def interpolate(row: OriginalNoise) -> Callable[[float, float], float]:
+        # The SSIM on a grid of scale and dynamic range, as a spline of their logarithms.
+        part = scan[(scan.dataset == row.dataset) & np.isclose(scan.noise_level, row.noise_level)]
+        grid = part.pivot(index="pixel_scale_arcsec", columns="data_range", values="ssim")
+        scale_order, range_order = (min(3, size - 1) for size in grid.shape)
+        logarithms = np.log(grid.index), np.log(grid.columns)
+        spline = RectBivariateSpline(*logarithms, grid.to_numpy(), kx=scale_order, ky=range_order)
+        return lambda scale, data_range: (
+            float(spline(np.log(scale), np.log(data_range))[0, 0]) - row.ssim
+        )
+
+    # Only fitted columns of the scanned datasets.
+    datasets = set(scan.dataset)
+    rows = [row for row in read_original_noise() if row.is_fitted and row.dataset in datasets]
+    return [(row.dataset, interpolate(row)) for row in rows]

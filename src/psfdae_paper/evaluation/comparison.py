@@ -135,14 +135,11 @@ def compare_evaluations(
     is_paired = share_noisy_stars(first, second)
     rows = []
     keys = ["method", "noise_level"]
-    second_groups = {key: table for key, table in second.groupby(keys, sort=False)}
-    for (method, level), first_stars in first.groupby(keys, sort=False):
-        second_stars = second_groups.get((method, level))
-        if second_stars is None:
-            continue
-        for metric in ("mse", "ssim"):
-            values = _compare_means(first_stars, second_stars, metric, is_paired, scatter)
-            rows.append({"metric": metric, "method": method, "noise_level": level, **values})
+    second_groups = dict(list(second.groupby(keys, sort=False)))
+    for key, stars in first.groupby(keys, sort=False):
+        for metric in ("mse", "ssim") if key in second_groups else ():
+            values = _compare_means(stars, second_groups[key], metric, is_paired, scatter)
+            rows.append({"metric": metric, **dict(zip(keys, key, strict=True)), **values})
     columns = [
         *("metric", "method", "noise_level", "first", "second"),
         *("difference", "stderr", "seed_stderr", "sigmas", "verdict"),
@@ -155,27 +152,22 @@ def _compare_means(
     first: pd.DataFrame, second: pd.DataFrame, metric: str, is_paired: bool, scatter: Scatter
 ) -> dict[str, float | str]:
     """Return a row of `compare_evaluations` for one method and noise level, without its keys."""
+    tables = [table.sort_values("star") for table in (first, second)]
+    values, fields = ([t[name].to_numpy() for t in tables] for name in (metric, "field"))
     if is_paired:
         # Mean of the differences of the same stars.
-        first, second = (table.sort_values("star") for table in (first, second))
-        change = second[metric].to_numpy() - first[metric].to_numpy()
-        difference, stderr = cluster_mean(change, first["field"].to_numpy())
+        difference, stderr = cluster_mean(values[1] - values[0], fields[0])
     else:
         # Difference of two independent means: their variances add.
-        means = [
-            cluster_mean(table[metric].to_numpy(), table["field"].to_numpy())
-            for table in (first, second)
-        ]
-        difference = means[1][0] - means[0][0]
-        stderr = float(np.hypot(means[0][1], means[1][1]))
+        means, errors = zip(*map(cluster_mean, values, fields), strict=True)
+        difference, stderr = means[1] - means[0], float(np.hypot(*errors))
     # Scatter of both trainings between seeds; 0 in the significance if it was not measured.
-    first_mean, second_mean = (float(table[metric].mean()) for table in (first, second))
-    fits = (tuple(table[FIT_KEYS].iloc[0]) for table in (first, second))
+    first_mean, second_mean = (float(v.mean()) for v in values)
     seed_errors = [
-        seed_stderr(scatter.get(fit, np.nan), metric, mean)
-        for fit, mean in zip(fits, (first_mean, second_mean), strict=True)
+        seed_stderr(scatter.get(tuple(table[FIT_KEYS].iloc[0]), np.nan), metric, mean)
+        for table, mean in zip(tables, (first_mean, second_mean), strict=True)
     ]
-    both_seeds_stderr = float(np.hypot(seed_errors[0], seed_errors[1]))
+    both_seeds_stderr = float(np.hypot(*seed_errors))
     # Significance: difference over σ = √(σ_stars² + σ_seeds²).
     error = np.hypot(stderr, np.nan_to_num(both_seeds_stderr))
     sigmas = float(0.0 if difference == 0 else difference / error if error > 0 else np.inf)
@@ -300,20 +292,16 @@ def measure_held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
         A row for each method and noise level: mean errors, their ratio (held out over random) with
         its standard error clustered by field, numbers of stars and of fields.
     """
-    rows = []
-    keys = [*FIT_KEYS, "noise_level"]
-    for key, errors in stars.groupby(keys, sort=False):
-        # Errors of one method at one noise level, in both splits.
-        by_split = [errors[errors.split == name] for name in ("random", "held_out")]
-        # Stars that both splits test: their errors differ because the training stars differ.
-        pairs = by_split[0].merge(
-            by_split[1], on=["star", "field"], suffixes=("_random", "_held_out")
-        )
-        if len(pairs):
-            held_out_mse, random_mse = pairs.mse_held_out.to_numpy(), pairs.mse_random.to_numpy()
-            ratio, stderr = cluster_ratio(held_out_mse, random_mse, pairs.field.to_numpy())
-            means = (random_mse.mean(), held_out_mse.mean())
-            rows.append((*key, *means, ratio, stderr, len(pairs), pairs.field.nunique()))
+    rows, keys = [], [*FIT_KEYS, "noise_level"]
+    # Stars that both splits test: their errors differ because the training stars differ.
+    random, held_out = (stars[stars.split == name] for name in ("random", "held_out"))
+    keys_of_stars = [*keys, "star", "field"]
+    pairs = random.merge(held_out, on=keys_of_stars, suffixes=("_random", "_held_out"))
+    for key, group in pairs.groupby(keys, sort=False):
+        held_out_mse, random_mse = group.mse_held_out.to_numpy(), group.mse_random.to_numpy()
+        ratio, stderr = cluster_ratio(held_out_mse, random_mse, group.field.to_numpy())
+        means = (random_mse.mean(), held_out_mse.mean())
+        rows.append((*key, *means, ratio, stderr, len(group), group.field.nunique()))
     columns = [*keys, "mse_random", "mse_held_out", "ratio", "stderr", "n", "fields"]
     return pd.DataFrame(rows, columns=columns)
 

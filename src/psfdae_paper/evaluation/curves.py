@@ -47,9 +47,9 @@ def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> F
         # The middle of a stamp has larger errors than a whole stamp: only epochs on whole stamps,
         # which are the last ones, are joined by a line that is compared with the validation.
         side_px = history.get("side_px", pd.Series(0, history.index))
-        whole = history[side_px == side_px.max()]
+        full_size = history[side_px == side_px.max()]
         axes.plot(history["step"], history["train_mse"], color=color, lw=0.8, ls=":", alpha=0.6)
-        axes.plot(whole["step"], whole["train_mse"], color=color, **WHOLE_STAMPS)
+        axes.plot(full_size["step"], full_size["train_mse"], color=color, **WHOLE_STAMPS)
         # The validation error is measured at few steps.
         validation_rows = history.dropna(subset=["validation_mse"])
         step, mse = validation_rows["step"], validation_rows["validation_mse"]
@@ -118,11 +118,8 @@ def draw_errors(
         for method_class, rows in drawing.group_by_method(reference_rows):
             for split_name, part in rows.groupby("split"):
                 line = part.sort_values("noise_level")
-                style = {
-                    **drawing.method_line(method_class),
-                    "ls": split_lines[str(split_name)],
-                    "capsize": 3,
-                }
+                style = {**drawing.method_line(method_class), "capsize": 3}
+                style["ls"] = split_lines[str(split_name)]
                 axes.errorbar(line["noise_level"], line["value"], yerr=line["stderr"], **style)
         for method_class, rows in drawing.group_by_method(paper_points):
             axes.plot(rows["noise_level"], rows["value"], **drawing.paper_marker(method_class))
@@ -140,8 +137,6 @@ def draw_errors(
     stars = ", ".join(f"{count} {split_name}" for split_name, count in counts.items())
     name = {"mse": "MSE", "ssim": "1 − SSIM"}[metric]
     title = f"{name} of {dataset} at {levels.size} noise levels, test stars: {stars}"
-    if note:
-        title = f"{title}\n{fill(note, 100)}"
-    label = drawing.METRIC_LABELS[metric]
+    title, label = f"{title}\n{fill(note, 100)}".strip(), drawing.METRIC_LABELS[metric]
     drawing.finish_panels(figure, panels, title, handles, columns=4, label=label)
     return figure

@@ -198,11 +198,11 @@ def _draw_mosaic(
     spacing = np.where(intervals > 0, (high - low) / np.maximum(intervals, 1), 1.0)
     # The centre of the outermost stamps is gap + side/2 pixels from the edge of the mosaic.
     margin = (gap + 0.5 * side) * (spacing / (side + gap))
-    (left, bottom), (right, top) = low - margin, high + margin
+    (x_min, y_min), (x_max, y_max) = low - margin, high + margin
     return axes.imshow(
         make_mosaic(stamps, grid, gap),
         origin="lower",
-        extent=(left, right, bottom, top),
+        extent=(x_min, x_max, y_min, y_max),
         interpolation="nearest",
         **style,
     )

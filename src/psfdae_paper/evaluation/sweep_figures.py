@@ -54,16 +54,9 @@ class Scale:
         for height, label in zip(self.to_unit(self.ticks), self.labels, strict=True):
             panel.plot([x - 0.012, x + 0.012], [height, height], color="black", lw=0.9, zorder=3)
             # Labels are above the lines of the points, on white that lets them shine through.
-            panel.annotate(
-                label,
-                (x, height),
-                xytext=(5, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-                zorder=4,
-                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-            )
+            box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
+            style: Style = {"va": "center", "fontsize": 8, "zorder": 4, "bbox": box}
+            panel.annotate(label, (x, height), (5, 0), textcoords="offset points", **style)
 
 
 def to_scale(texts: Sequence[str], logarithmic: bool = False) -> Scale:
@@ -120,8 +113,7 @@ class SweepPoints:
     @property
     def metric(self) -> str:
         """Column of the metric that chooses the best point."""
-        name: str = self.definition["metric"]
-        return name
+        return str(self.definition["metric"])
 
     @property
     def is_logarithmic(self) -> bool:

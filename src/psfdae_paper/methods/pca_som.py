@@ -13,13 +13,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
-from psfdae.base.files import Column, write_product
 from psfdae.base.rng import stream
 from psfdae.base.settings import Count, Group, Positive
 from psfdae.methods.interface import FitError, Look, Method, Needs, Storage, TrainingSet
@@ -166,22 +164,16 @@ class PcaSom(Method):
                 f"{' that are not used for validation' if validation else ''}"
             )
         # One fit for each noise level, or a single one for noise of all levels, marked by level 0.
-        settings = baseline.model_dump(exclude={"threads", "per_level"})
         seed = int(stream(data.seed, "baseline", "map").integers(2**31))
         level = np.sort(data.levels) if baseline.per_level else np.zeros(1)
-        return cls(
-            level,
-            tuple(
-                fit_pca_som(noisy, **settings, seed=seed)
-                for noisy in _draw_noisy_images(data, level, f"baseline{validation}")
-            ),
-        )
+        images = _draw_noisy_images(data, level, f"baseline{validation}")
+        return cls(level, tuple(fit_pca_som(noisy, baseline, seed) for noisy in images))
 
-    def save(self, place: Path, described: Mapping[str, Any]) -> None:
-        """Write the arrays of all fits with their resolved configuration."""
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays of all fits."""
         # Arrays of equal shapes are stacked. Fits may differ in the number of nodes: these arrays
         # are joined, and `owner` is the number of each node's fit.
-        values = {
+        return {
             "level": self.level,
             "mean": np.stack([fit.mean for fit in self.fits]),
             "components": np.stack([fit.components for fit in self.fits]),
@@ -189,27 +181,20 @@ class PcaSom(Method):
             "psf": np.concatenate([fit.psf for fit in self.fits]),
             "owner": np.repeat(np.arange(len(self.fits)), [len(fit.nodes) for fit in self.fits]),
         }
-        columns = {
-            name: Column(values[name], *unit_and_meaning)
-            for name, unit_and_meaning in self.list_arrays().items()
-        }
-        write_product(place, self.name, columns, described)
 
     @classmethod
     def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """Make the fits from the arrays that `save` has written."""
-        # `owner` is the number of each node's fit.
-        node_masks = [arrays["owner"] == i for i in range(len(arrays["level"]))]
-        stored_fits = zip(arrays["mean"], arrays["components"], node_masks, strict=True)
-        return cls(
-            arrays["level"],
-            tuple(
-                PcaFit(mean, components, arrays["nodes"][mask], arrays["psf"][mask])
-                for mean, components, mask in stored_fits
-            ),
-        )
+        """Make the fits from the arrays of `to_arrays`."""
+        fits = []
+        for number, (mean, components) in enumerate(
+            zip(arrays["mean"], arrays["components"], strict=True)
+        ):
+            # `owner` is the number of each node's fit.
+            is_own = arrays["owner"] == number
+            fits.append(PcaFit(mean, components, arrays["nodes"][is_own], arrays["psf"][is_own]))
+        return cls(arrays["level"], tuple(fits))
 
     def predict(self, images: np.ndarray, level: float | np.ndarray) -> np.ndarray:
         """Predict the PSF of every image by the fit of the nearest λ on a logarithmic scale.
@@ -249,16 +234,7 @@ def _draw_noisy_images(data: TrainingSet, levels: np.ndarray, name: str) -> Iter
             yield data.draw(data.train, stream(data.seed, "noise", name))[0]
 
 
-def fit_pca_som(
-    images: np.ndarray,
-    components: int,
-    rows: int,
-    columns: int,
-    epochs: int,
-    sigma: float,
-    learning_rate: float,
-    seed: int,
-) -> PcaFit:
+def fit_pca_som(images: np.ndarray, settings: Baseline, seed: int) -> PcaFit:
     """Fit the baseline on noisy star images of one level, or of mixed ones.
 
     Nodes without training stars, which have no mean image, are left out of the fitted
@@ -268,32 +244,16 @@ def fit_pca_som(
     ----------
     images : ndarray, shape (n, d, d)
         Noisy training stars of sum 1.
-    components : int
-        K, at most min(n, d²).
-    rows, columns : int
-        Size of the map.
-    epochs : int
-        Passes over the stars (t_max).
-    sigma, learning_rate : float
-        Initial values; the neighbourhood radius `sigma` is in nodes.
+    settings : Baseline
+        Number of components K, at most min(n, d²), and the training of the map.
     seed : int
         Seed of the map's initial weights and of the order of stars.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer images than components.
     """
     flat = images.reshape(len(images), -1).astype(np.float64)
-    if components > min(flat.shape):
-        raise ValueError(
-            f"baseline.components = {components}: must be at most {min(flat.shape)} "
-            f"(stars and pixels: {flat.shape})"
-        )
     # Coefficients of the stars along the principal axes, on which the map is trained.
-    mean, axes = principal_axes(flat, components)
+    mean, axes = principal_axes(flat, settings.components)
     features = flat @ axes.T - mean @ axes.T
-    nodes = train_map(features, (rows, columns), epochs, sigma, learning_rate, seed)
+    nodes = train_map(features, settings, seed)
     # Cluster of each star, and the mean image of each cluster that has stars.
     whole_map = PcaFit(mean, axes, nodes, np.empty((len(nodes), flat.shape[1])))
     winner = whole_map.assign(images)
@@ -329,14 +289,7 @@ def principal_axes(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return mean, axes * np.sign(largest)
 
 
-def train_map(
-    features: np.ndarray,
-    shape: tuple[int, int],
-    epochs: int,
-    sigma: float,
-    learning_rate: float,
-    seed: int,
-) -> np.ndarray:
+def train_map(features: np.ndarray, settings: Baseline, seed: int) -> np.ndarray:
     """Train a self-organising map on features (n, K); parameters as for `fit_pca_som`.
 
     The nodes are MiniSom's to the last bit, in less time. Two things are computed only once: the
@@ -364,14 +317,18 @@ def train_map(
     def rates(epoch: int) -> list[np.ndarray]:
         """Return η h, the rates of all nodes (M, 1), for each possible winner."""
         # MiniSom's asymptotic decay of learning rate and radius.
-        decay = 1.0 + epoch / (epochs / 2)
-        neighbourhoods = [som.neighborhood(node, sigma / decay) for node in np.ndindex(shape)]
-        return [(h * (learning_rate / decay)).reshape(-1, 1) for h in neighbourhoods]
+        decay = 1.0 + epoch / (settings.epochs / 2)
+        radius, rate = settings.sigma / decay, settings.learning_rate / decay
+        return [
+            (rate * som.neighborhood(node, radius)).reshape(-1, 1) for node in np.ndindex(shape)
+        ]
 
-    som = Map(*shape, features.shape[1], sigma=sigma, learning_rate=learning_rate, random_seed=seed)
+    shape = (settings.rows, settings.columns)
+    initial = {"sigma": settings.sigma, "learning_rate": settings.learning_rate}
+    som = Map(*shape, features.shape[1], **initial, random_seed=seed)
     som.random_weights_init(features)
     # A view of the map's weights: MiniSom's training changes the array that is returned.
     nodes: np.ndarray = som.get_weights().reshape(-1, features.shape[1])
     difference = np.empty_like(nodes)
-    som.train(features, epochs, random_order=True, use_epochs=True)
+    som.train(features, settings.epochs, random_order=True, use_epochs=True)
     return nodes

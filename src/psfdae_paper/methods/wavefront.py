@@ -212,16 +212,16 @@ class Wavefront(Method):
         is_explained : ndarray of bool, shape (n,)
             True where a sample has a positive weight and, if modes were searched, one was found.
         """
-        from psfdae_paper.bounds.estimates import ENOUGH_ESS
+        from psfdae_paper.bounds.estimates import ENOUGH_ESS, sum_over_bank
         from psfdae_paper.bounds.sampling import sample_posterior
         from psfdae_paper.bounds.stamp_model import StarPosteriors
 
         # First by the stars of the bank, whose weights are their likelihoods.
-        sums = self._sums_over_bank(noisy, level, self._fields(position))
+        likelihood = self.likelihood(level)
+        sums = sum_over_bank(self.bank, noisy, likelihood, self._fields(position))
         is_explained = np.ones(len(noisy), bool)
         # Stars whose effective number of similar bank stars is too small.
         undersampled_stars = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
-        likelihood = self.likelihood(level)
         for start in range(0, len(undersampled_stars), 256):  # stars whose matches fit in memory
             block = undersampled_stars[start : start + 256]
             fields = None if position is None else position[block]
@@ -243,48 +243,3 @@ class Wavefront(Method):
         # Fields are numbered ix + P iy on a grid of P points a side.
         fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
         return fields
-
-    def _sums_over_bank(
-        self, noisy: np.ndarray, level: float, star_field: np.ndarray | None
-    ) -> PosteriorSums:
-        """Sum over an eighth of the bank, and over all of it where this is likely to be enough.
-
-        Parameters
-        ----------
-        noisy : ndarray, shape (n, d, d)
-            Noisy stars.
-        level : float
-            Noise level λ.
-        star_field : ndarray of int, shape (n,), optional
-            Number of each star's field, if the method is given it.
-        """
-        from psfdae_paper.bounds.estimates import ENOUGH_ESS
-        from psfdae_paper.bounds.posterior import (
-            PosteriorSums,
-            group_by_field,
-            merge,
-            sum_posterior,
-        )
-
-        likelihood, fields, shifts = self.likelihood(level), *self.static.shape[:2]
-        sums = PosteriorSums.empty(len(noisy), noisy[0].size, fields, shifts)
-
-        def weigh(stars: np.ndarray, bank_stars: np.ndarray) -> PosteriorSums:
-            field = None if star_field is None else star_field[stars]
-            bank = self.bank.take(bank_stars)
-            return sum_posterior(bank, noisy[stars], likelihood, star_field=field)
-
-        # Stars whose field is given are compared with the bank's stars of this field
-        # and of its mirror images.
-        for stars, bank_stars in group_by_field(len(noisy), star_field, self.bank):
-            eighth = len(bank_stars) // 8
-            first_sums = weigh(stars, bank_stars[:eighth])
-            sums.put(stars, first_sums)
-            # The effective sample size grows in proportion to the bank: the whole bank is used for
-            # stars with too few samples of an eighth of it, and enough of all of it.
-            size = first_sums.effective_size
-            promising = (size < ENOUGH_ESS) & (8 * size >= ENOUGH_ESS)
-            if promising.any():
-                further_sums = weigh(stars[promising], bank_stars[eighth:])
-                sums.put(stars[promising], merge([first_sums.select(promising), further_sums]))
-        return sums

@@ -248,16 +248,10 @@ def telescope(config: Config, model: ModelFile, grid: File, uniform: File, out: 
     out : Path
         CSV with key figures.
     """
-    # The model, and the two test sets.
+    # The model and the two test sets must belong to the configured telescope.
     quadratic = read_product(model, "alignment_model")
-    sets = {
-        name: read_product(path, "alignment_states", ("energy", "stamps"))
-        for name, path in (("grid", grid), ("uniform", uniform))
-    }
-    # All products must belong to the configured telescope.
     require(model, quadratic.config, Alignment.wavefront_keys, config)
-    for product in sets.values():
-        require(product.path, product.config, Alignment.stamp_keys, config)
+    sets = {"grid": read_states(grid, config), "uniform": read_states(uniform, config)}
     # Arrays [field, term, Zernike], [state, field], [Zernike].
     coefficients, residual, noll = (quadratic[k] for k in ("coefficients", "residual", "noll"))
     # Linear terms as a matrix from the four numbers of a state to all Zernike terms of all fields:

@@ -10,8 +10,6 @@ from __future__ import annotations
 import errno
 import shutil
 import tarfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -57,8 +55,8 @@ def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
     manifest = results / CHECKSUMS
     if not manifest.is_file():
         raise ProductError(f"{manifest}: missing; `psfdae paper manifest` writes it")
-    recorded = read_checksums(manifest.read_text())
-    paths = {name: results / name for name in (*RUN_FILES, *recorded)}
+    product_sums = read_checksums(manifest.read_text())
+    paths = {name: results / name for name in (*RUN_FILES, *product_sums)}
     paths[CITATION] = SOURCES.parent / CITATION
     for name, path in paths.items():
         if not path.is_file():
@@ -67,7 +65,7 @@ def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
     sums = {}
     for name, path in steps("checksums", paths.items()):
         sums[name] = compute_sha256(path)
-        if recorded.get(name, sums[name]) != sums[name]:
+        if product_sums.get(name, sums[name]) != sums[name]:
             raise ProductError(f"{path}: differs from its checksum in {manifest}")
     lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items()).encode()
     with (
@@ -124,26 +122,17 @@ def fetch(file: Annotated[File, {"argument": True}], results: Folder) -> None:
     results.parent.mkdir(parents=True, exist_ok=True)
     # Beside the folder, on the same file system, so that complete files are moved into it.
     place = TemporaryDirectory(prefix=".fetch-", dir=results.parent)
-    with place as temporary, explain_damage(file):
-        folder = Path(temporary)
-        unpack(file, folder)
-        entries = sorted(folder.iterdir())
-        for entry in entries:
-            if (results / entry.name).exists():
-                raise ArchiveError(
-                    f"{results / entry.name}: exists; name a folder without a run (RESULTS=…)"
-                )
-        # The run counts as finished with its record, which comes last.
-        results.mkdir(exist_ok=True)
-        for entry in sorted(entries, key=lambda path: path.name == RUN_FILES[0]):
-            shutil.move(entry, results / entry.name)
-
-
-@contextmanager
-def explain_damage(file: Path) -> Iterator[None]:
-    """Raise an ArchiveError with the name of the file where tarfile or the system fails."""
     try:
-        yield
+        with place as temporary:
+            unpack(file, Path(temporary))
+            # The run counts as finished with its record, which comes last.
+            entries = sorted(Path(temporary).iterdir(), key=lambda path: path.name == RUN_FILES[0])
+            for target in (results / entry.name for entry in entries):
+                if target.exists():
+                    raise ArchiveError(f"{target}: exists; name a folder without a run (RESULTS=…)")
+            results.mkdir(exist_ok=True)
+            for entry in entries:
+                shutil.move(entry, results / entry.name)
     except (tarfile.TarError, EOFError, UnicodeDecodeError, OSError) as error:
         is_sound = isinstance(error, OSError) and error.errno in MACHINE_ERRORS
         cause = "cannot be unpacked" if is_sound else "truncated, damaged or no archive of a run"

@@ -78,7 +78,7 @@ def scan(config: Config, dataset: str, out: File) -> None:
             telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
             search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
             propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
-            images = normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
+            images = normalise_flux(propagation.frame(config.framing.stamp_px)[0])[0]
             for row in rows:
                 # Noise with the MSE that the paper prints for this column.
                 noisy = _add_published_noise(images, row, config)

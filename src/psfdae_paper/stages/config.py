@@ -13,7 +13,7 @@ import yaml
 
 from psfdae.commands.cli import command_modules, stage
 from psfdae_paper.configuration.command import Groups, command
-from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.configuration.compose import load
 
 
 @command("paper config")
@@ -38,14 +38,12 @@ def config(
     else:
         # "alignment model", "alignment_model" and "alignment-model" name the same stage.
         names = {_key(name.removeprefix("paper ")): name for name in command_modules()}
-        reader = None
-        if _key(only) in names:
-            reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
+        name = names.get(_key(only))
+        reader = stage(name).stage.settings if name else None  # type: ignore[attr-defined]
         if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names.values()))}")
         # Groups of the stage without options; a stage may read more with some of them.
-        groups = Groups(reader.names({}), reader.choice)
-        settings = load_stage(groups.names({}), groups.prepend_choice(overrides))
+        settings = Groups(reader.names({}), reader.choice)({}, None, overrides)
     # In the order of the classes, as in the documentation.
     click.echo(yaml.safe_dump(settings.model_dump(), sort_keys=False), nl=False)
 

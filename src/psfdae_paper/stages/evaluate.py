@@ -44,14 +44,14 @@ READS = (
 Methods that store no model are fitted by the stage, and their settings are among these groups.
 """
 
-STORED = {m.name: Folder if m.storage.files else File for m in list_methods() if m.storage}
+FIT_PATH_TYPES = {m.name: Folder if m.storage.files else File for m in list_methods() if m.storage}
 """Type of the path of each method that stores a model: its folder or file."""
 
 Models = make_dataclass(
     "Models",
     [
         (name, Annotated[path_type | None, f"Result of `psfdae paper fit {name}`."], None)
-        for name, path_type in STORED.items()
+        for name, path_type in FIT_PATH_TYPES.items()
     ],
     namespace={"__doc__": "Fits of the methods."},
 )
@@ -184,12 +184,12 @@ def estimators(
     # Methods without a file are fitted here.
     methods: dict[str, Method] = {}
     for method_class in classes:
-        if method_class.storage:
-            path = paths[method_class.name]
-            methods[method_class.name] = method_class.load(path, reference, config.evaluation)
+        name = method_class.name
+        if name in paths:
+            methods[name] = method_class.load(paths[name], reference, config.evaluation)
         else:
             data = training_set(config, method_class, stars, split, reference)
-            methods[method_class.name] = method_class.fit(data, **method_class.settings(config))
+            methods[name] = method_class.fit(data, **method_class.settings(config))
     return methods
 
 

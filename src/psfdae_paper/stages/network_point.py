@@ -7,8 +7,6 @@ and in physical units.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
@@ -21,7 +19,7 @@ from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.estimators import Estimator
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.alignment_tables import Row, tabulate_errors
+from psfdae_paper.evaluation.alignment_tables import tabulate_errors
 from psfdae_paper.stages.alignment_methods import (
     draw_test_stamps,
     load_predictor,
@@ -79,20 +77,15 @@ def measure(config: Config, task: Task, model: str) -> Measurement:
     for role, test_set in (("validation", "validation"), ("test", "uniform")):
         product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
         predict = load_predictor(task.folder, product, config)
-        # Errors at all noise levels, in rows as in the main workflow.
-        rows: list[Row] = []
+        rows, mae = [], {}
         for level in task.levels:
             stamps = draw_test_stamps(config, product["stamps"], test_set, level)
-            # The column of the method has the name of the point.
+            errors = predict(stamps) - product["states"]
+            # Mean absolute error over the four numbers of the state, in units of their range.
+            mae[f"{role}_mae_{level:g}"] = float(np.abs(errors).mean(axis=0).mean())
+            # Rows as in the main workflow; the column of the method has the name of the point.
             key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
-            rows += tabulate_errors(key, predict(stamps) - product["states"], product["unit"])
-        # Mean absolute error over the four numbers of the state, in units of their range, at
-        # each noise level.
-        mae: dict[str, float] = {}
-        for level in task.levels:
-            at_level = [row for row in rows if row["noise_level"] == level]
-            errors: Any = [row["mean_abs_error"] for row in at_level if row["unit"] == "range"]
-            mae[f"{role}_mae_{level:g}"] = float(np.mean(errors))
+            rows += tabulate_errors(key, errors, product["unit"])
         # Over the levels, the geometric mean.
         metrics |= {f"{role}_mae": geometric_mean(list(mae.values())), **mae}
         write_csv(task.folder / task.tables[role], pd.DataFrame(rows))

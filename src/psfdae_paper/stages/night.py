@@ -14,18 +14,33 @@ import traceback
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
+import pandas as pd
 
 from psfdae.base.errors import Error
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.commands.cli import parse_options, refusal
+from psfdae.commands.wavefront import check_scale, field_angles
 from psfdae.denoise.bundle import SUFFIX
+from psfdae.denoise.star_model import StarModel
 from psfdae.image.image_input import ImageInput, ImageOptions
 from psfdae.image.tables import write_table
+from psfdae.methods.field import FieldMixture
+from psfdae.photometry.image_photometry import measure_all_stars
+from psfdae.report.validation import validate
+from psfdae.sensing.results import wavefront
+from psfdae.stars.moments import measure_shapes
+from psfdae.telescope.settings import read_telescope
+from psfdae.training.exposures import adapt_to_stars
+from psfdae.training.fitting import fit_method, pack_model
+from psfdae.training.from_image import collect_stars
+from psfdae.training.settings import apply_keywords, settings_model
+from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
+from psfdae.training.stars import ImageStars
 from psfdae_paper.configuration.command import command
 from psfdae_paper.evaluation.night import (
     TABLE_COLUMNS,
@@ -35,10 +50,6 @@ from psfdae_paper.evaluation.night import (
     read_night,
 )
 from psfdae_paper.stars.nights import locate_places, measure_places
-
-if TYPE_CHECKING:
-    from psfdae.denoise.star_model import StarModel
-    from psfdae.training.stars import ImageStars
 
 Row = dict[str, object]
 
@@ -113,8 +124,6 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
     out : Path
         CSV with a row for each image and its measurements.
     """
-    from pandas import DataFrame
-
     listed_rows = read_text_rows(rows, "image", "name", "reason")
     results: dict[str, Row] = {row["name"]: {**row} for row in listed_rows}
     # Bright stars of the images, by camera, filter and size of stamps, which a model cannot change.
@@ -149,7 +158,7 @@ def night_images(rows: File, folder: Folder, out: File) -> None:
             except Exception as error:
                 results[name]["reason"] = explain_error(error, results[name])
             print(name, results[name]["reason"] or "done", flush=True)
-    write_csv(out, DataFrame(list(results.values())))
+    write_csv(out, pd.DataFrame(list(results.values())))
 
 
 @command("paper night table")
@@ -164,11 +173,10 @@ def night_table(parts: Annotated[tuple[File, ...], {"argument": True}], out: Fil
         CSV of the night; an ECSV with units is written to the same folder.
     """
     from astropy.table import QTable
-    from pandas import concat
 
     # A part without a usable image lacks the columns of measurements.
     tables = [read_night(path, "image", "name", "reason") for path in parts]
-    night = concat(tables, ignore_index=True)
+    night = pd.concat(tables, ignore_index=True)
     texts = [name for name in night if night[name].dtype.kind == "O"]
     night = add_verdicts(night.fillna(dict.fromkeys(texts, "")))
     write_csv(out, night)
@@ -236,9 +244,6 @@ def explain_error(error: Exception, row: Mapping[str, object]) -> str:
 
 def bright_stars(row: Mapping[str, object]) -> ImageStars:
     """Return the bright stars of an image of the list; without a catalogue they are detected."""
-    from psfdae.training.from_image import collect_stars
-    from psfdae.training.settings import settings_model
-
     values = parse_options(ImageOptions, {name: str(text) for name, text in row.items()})
     source = ImageInput(Path(str(row["image"])), **{"detect": "catalogue" not in values, **values})
     return collect_stars([source], settings_model()())
@@ -246,8 +251,6 @@ def bright_stars(row: Mapping[str, object]) -> ImageStars:
 
 def measure_sizes(stars_by_name: Mapping[str, ImageStars]) -> dict[str, np.ndarray]:
     """Return the logarithms of the FWHM (px) and axis ratio of an image's mean PSF, by its name."""
-    from psfdae.stars.moments import measure_shapes
-
     shapes = measure_shapes(np.stack([stars.mean_psf for stars in stars_by_name.values()]))
     sizes = np.log([shapes.fwhm_px, 1.0 - shapes.ellipticity]).T
     return dict(zip(stars_by_name, sizes, strict=True))
@@ -273,12 +276,6 @@ def order_images(
 
 def fit_image(stars: ImageStars, start: StarModel | None) -> StarModel:
     """Fit the field model of an image, starting from the model of another image if there is one."""
-    from psfdae.methods.field import FieldMixture
-    from psfdae.training.exposures import adapt_to_stars
-    from psfdae.training.fitting import fit_method, pack_model
-    from psfdae.training.settings import apply_keywords
-    from psfdae.training.star_choice import MIN_STARS_WITH_ERROR
-
     # Fewer stars than this cannot show how the field has changed.
     training_stars = np.count_nonzero(~stars.held_out)
     if start is None or training_stars < MIN_STARS_WITH_ERROR:
@@ -311,10 +308,6 @@ def fit_telescope(stars: ImageStars, telescope: Path) -> Row:
         Values and errors by names such as `telescope_z4.constant_wave` and
         `telescope_z4.constant_wave_error`; or `telescope_reason`, why they cannot be measured.
     """
-    from psfdae.commands.wavefront import check_scale, field_angles
-    from psfdae.sensing.results import wavefront
-    from psfdae.telescope.settings import read_telescope
-
     # Thirty stars determine ten numbers, in some seconds.
     bright = stars.candidates.bright.row
     brightest = bright[np.argsort(-stars.candidates.snr[bright])[:30]]
@@ -358,9 +351,6 @@ def measure_image(
         of bright, measured and flagged stars; magnitude of the 20th brightest star without a flag
         in counts, NaN if there are fewer; zero point and its scatter; median χ² of the stars.
     """
-    from psfdae.photometry.image_photometry import measure_all_stars
-    from psfdae.report.validation import validate
-
     path = folder / str(row["name"])
     reference = Path(str(row["reference"])) if row.get("reference") else None
     photometry = measure_all_stars(

@@ -281,22 +281,15 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
     }
 
 
-def measure_matrix_speed(size: int = 1024, repeats: int = 5) -> float:
+def measure_matrix_speed() -> float:
     """Measure the speed of a float32 matrix product in GFLOP/s, the best of some repeats.
 
     Run times of two machines are expected to be in the inverse ratio of these speeds.
-
-    Parameters
-    ----------
-    size : int
-        Rows and columns of the matrices.
-    repeats : int
-        Number of products; other work on the machine slows most of them, but rarely all.
     """
     # Values do not matter for the speed.
-    a = np.ones((size, size), dtype=np.float32)
-    # A product takes 2 n³ operations.
-    return 2.0 * size**3 / min(timeit.repeat(lambda: a @ a, repeat=repeats, number=1)) / 1e9
+    a = np.ones((1024, 1024), dtype=np.float32)
+    # A product takes 2 n³ operations. Other work on the machine slows most of them, but rarely all.
+    return 2.0 * len(a) ** 3 / min(timeit.repeat(lambda: a @ a, repeat=5, number=1)) / 1e9
 
 
 def _busy_seconds(benchmarks: Path) -> float:

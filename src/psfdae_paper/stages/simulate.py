@@ -259,7 +259,7 @@ def _find_stamp_px(
         propagation = Propagation(
             source, config.telescope, config.optics, framing, framing.search_px
         )
-        stamp = propagation.framed(max_px, stars=np.array([worst_field]))[0][0]
+        stamp = propagation.frame(max_px, stars=np.array([worst_field]))[0][0]
     except (SamplingError, FramingError):
         return None
     # Smaller stamps are the middle of the largest one.

@@ -50,7 +50,7 @@ def templates(config: Config, out: File) -> None:
     source = template_wavefronts(config)
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
     side = framing.stamp_px + 2 * framing.jitter_px
-    psf, peak = propagation.framed(side)
+    psf, peak = propagation.frame(side)
     # The stamp without the margin.
     stamp = slice(framing.jitter_px, side - framing.jitter_px)
     # Field angles of a square grid, centred on the optical axis.
@@ -137,12 +137,12 @@ def stars(config: Config, templates: File, out: File) -> None:
             # Indices of the stars that are made together.
             part = np.arange(start, min(start + STARS_AT_A_TIME, count))
             # The static PSF of the field, cut with the centring error of the star.
-            propagate_static_psfs = static["psf"][star_field[part]].astype(np.float64)
-            jittered_psfs = crop_jittered(propagate_static_psfs, jitter[part], framing.jitter_px)
+            static_psfs = static["psf"][star_field[part]].astype(np.float64)
+            jittered_psfs = crop_jittered(static_psfs, jitter[part], framing.jitter_px)
             arrays = dict(zip(("template", "energy"), normalise_flux(jittered_psfs), strict=True))
             # The star's own image; the light inside the stamp refers to the realisation.
             if propagation is not None:
-                stamps, peak = propagation.framed(framing.stamp_px, jitter[part], part, phase[part])
+                stamps, peak = propagation.frame(framing.stamp_px, jitter[part], part, phase[part])
                 arrays["realisation"], arrays["energy"] = normalise_flux(stamps)
                 arrays["peak"] = peak
             for column, values in arrays.items():

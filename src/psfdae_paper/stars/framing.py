@@ -8,6 +8,7 @@ search for the brightest pixel, which all stages share.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -83,12 +84,12 @@ def find_contested(images: np.ndarray, tie: float) -> tuple[np.ndarray, np.ndarr
     return image, row, column
 
 
-def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.ndarray:
+def crop_jittered(frames: np.ndarray, jitter: np.ndarray, margin: int) -> np.ndarray:
     """Cut stamps out of images that were framed without jitter and with a margin.
 
     Parameters
     ----------
-    framed : ndarray, shape (B, d + 2·margin, d + 2·margin)
+    frames : ndarray, shape (B, d + 2·margin, d + 2·margin)
         Brightest pixel at index d/2 + margin.
     jitter : ndarray of int, shape (B, 2) or (2,)
         (row, column) by which the brightest pixel moves in the stamp, |jitter| ≤ margin.
@@ -101,10 +102,10 @@ def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.nda
     """
     # The first pixel of the stamp is at margin − jitter: a brightest pixel that moves by +1 in
     # the stamp needs a cut that begins one pixel earlier.
-    pixels = np.arange(framed.shape[-1] - 2 * margin)
-    index = np.broadcast_to(margin - np.asarray(jitter), (len(framed), 2))[:, :, None] + pixels
-    stars = np.arange(len(framed))[:, None, None]
-    stamps: np.ndarray = framed[stars, index[:, 0, :, None], index[:, 1, None, :]]
+    pixels = np.arange(frames.shape[-1] - 2 * margin)
+    index = np.broadcast_to(margin - np.asarray(jitter), (len(frames), 2))[:, :, None] + pixels
+    stars = np.arange(len(frames))[:, None, None]
+    stamps: np.ndarray = frames[stars, index[:, 0, :, None], index[:, 1, None, :]]
     return stamps
 
 
@@ -157,6 +158,7 @@ def search_windows(
     return centre, reach
 
 
+@dataclass(eq=False)
 class Propagation:
     """Stamps and brightest pixels of the wavefronts of one source.
 
@@ -183,24 +185,19 @@ class Propagation:
         If a wavefront needs more samples than the largest grid has.
     """
 
-    def __init__(
-        self,
-        source: WavefrontSource,
-        telescope: Telescope,
-        optics: Optics,
-        framing: Framing,
-        search_px: int,
-    ) -> None:
-        self.search_px = search_px
-        self.source = source
-        self.telescope = telescope
-        self.optics = optics
-        self.framing = framing
+    source: WavefrontSource
+    telescope: Telescope
+    optics: Optics
+    framing: Framing
+    search_px: int
+
+    def __post_init__(self) -> None:
+        telescope, optics, framing = self.telescope, self.optics, self.framing
         pixel = telescope.pixel  # width in λ/D
         # Farthest point of the focal plane that any stamp can contain, in λ/D: a peak at the
         # border of the largest search window, half a stamp, and the centring errors.
-        reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
-        edge = reach * pixel
+        reach_px = 2 * self.search_px + 0.5 * framing.stamp_px + framing.jitter_px
+        edge = (reach_px + 0.5 * framing.subpixel) * pixel
         # Seeing carries light into the stamp from as far as its profile reaches.
         seeing = telescope.seeing if isinstance(telescope, OwnTelescope) else None
         self._blur = telescope.blur if isinstance(telescope, OwnTelescope) else None
@@ -213,10 +210,10 @@ class Propagation:
                     f"optics.pupil_samples = {optics.pupil_samples}"
                 )
         # The smallest pupil grid without aliasing within ± edge, from the wavefront's slopes.
-        slopes = source.slopes()
+        slopes = self.source.slopes()
         min_samples = count_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(min_samples, tuple(optics.pupil_samples))
-        self._centre, self._reach = search_windows(slopes, pixel, search_px)
+        self._centre, self._reach = search_windows(slopes, pixel, self.search_px)
         self._pupils: dict[int, Pupil] = {}
 
     def stamps(
@@ -254,7 +251,7 @@ class Propagation:
         self._run(stars, prepare)
         return stamps
 
-    def framed(
+    def frame(
         self,
         side: int,
         jitter: np.ndarray | int = 0,

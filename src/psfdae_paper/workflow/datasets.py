@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 
 from psfdae.base.reading import read_yaml
@@ -177,9 +178,7 @@ def stars_file(run: Run, dataset: str) -> str:
 def networks(run: Run, dataset: str) -> list[tuple[str, str]]:
     """Return split and reference of each network of a dataset."""
     group = load_dataset_config(run, dataset).dataset
-    return [
-        (split_name, reference) for split_name in group.splits for reference in group.references
-    ]
+    return list(product(group.splits, group.references))
 
 
 def evaluations(run: Run, dataset: str, splits: Sequence[str] = ()) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import product
 from typing import Any
 
 from psfdae.methods import fit_files, method
@@ -228,22 +229,12 @@ def histories(run: Run, dataset: str) -> dict[str, str]:
     """Return the tables with the courses of a dataset's trainings, each with its label."""
     # Not every method leaves a table with the course of its training.
     group = load_dataset_config(run, dataset).dataset
-    trainings = [
-        m
-        for m in list_stored_methods(run, dataset)
-        if HISTORY in fit_files.get_storage(m).diagnostics
-    ]
+    methods = list_stored_methods(run, dataset)
+    trainings = [m for m in methods if HISTORY in fit_files.get_storage(m).diagnostics]
     labels = {}
-    for m in trainings:
-        for split_name in group.splits:
-            for reference in group.references:
-                place = fit_place(run, m.name, dataset, split_name, reference)
-                # The method's label distinguishes courses of several methods.
-                words = [
-                    dataset,
-                    split_name,
-                    reference,
-                    *([m.look.label] if len(trainings) > 1 else []),
-                ]
-                labels[str(fit_files.path_beside(m, place, HISTORY))] = ", ".join(words)
+    for m, *key in product(trainings, group.splits, group.references):
+        place = fit_place(run, m.name, dataset, *key)
+        # The method's label distinguishes courses of several methods.
+        words = [dataset, *key, *([m.look.label] if len(trainings) > 1 else [])]
+        labels[str(fit_files.path_beside(m, place, HISTORY))] = ", ".join(words)
     return labels

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from inspect import getdoc
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
@@ -56,7 +57,7 @@ def find_differences(run: Run, dataset: str) -> Differences:
     run : Run
         The run.
     dataset : str
-        Option of the group dataset.
+        Option of the group dataset; or variant of an experiment, compared with its dataset.
 
     Returns
     -------
@@ -65,22 +66,28 @@ def find_differences(run: Run, dataset: str) -> Differences:
         depends on, and settings of methods that the dataset does not have, are left out.
     """
     # The same dataset with the paper's settings.
-    own, paper = (
-        dict(leaves(drop_neutral_settings(load_dataset_config(r, dataset).model_dump())))
-        for r in (run, Run("paper", ("preset=paper",), run.results))
+    base = {variant.name: variant.dataset for variant in run.variants}.get(dataset, dataset)
+    paper_run = Run("paper", ("preset=paper",), run.results)
+    values, paper_values = (
+        dict(leaves(drop_neutral_settings(load_dataset_config(*choice).model_dump())))
+        for choice in ((run, dataset), (paper_run, base))
     )
     # Scene 3 has only groups of its own; other datasets also have groups of targets on request.
-    groups = {key.partition(".")[0] for key in own}
+    groups = {key.partition(".")[0] for key in values}
     if dataset != SCENE3:
         names = method_names(run, dataset)
         groups &= DATA.union(*(method(name).groups for name in names))
     texts: Differences = {"data": [], "training": []}
-    for key, value in own.items():
+    for key, value in values.items():
         group = key.partition(".")[0]
-        if group in groups - {"workflow", "dataset"} and value != paper.get(key):
+        if group in groups - {"workflow", "dataset"} and value != paper_values.get(key):
             # Values as a user writes them, such as null.
             text = f"{key} = {as_literal(value)}"
-            text += f" instead of {as_literal(paper[key])}" if key in paper else ", not in paper"
+            text += (
+                f" instead of {as_literal(paper_values[key])}"
+                if key in paper_values
+                else ", not in paper"
+            )
             texts["data" if group in DATA else "training"].append(text)
     # Single numbers before long lists.
     return {kind: sorted(differences, key=len) for kind, differences in texts.items()}
@@ -154,29 +161,19 @@ def find_headline_file(
     Snakemake's own list of files has only one of each name.
     """
     # Snakemake groups the files of a report by category and subcategory.
-    files = [
-        file
-        for subcategories in categories.values()
-        for group in subcategories.values()
-        for file in group
-        if file.path.match(pattern)
-    ]
+    groups = chain.from_iterable(category.values() for category in categories.values())
+    files = [file for file in chain.from_iterable(groups) if file.path.match(pattern)]
     # False sorts before True: the headline dataset comes first, then the order of the paths.
-    return min(
-        files,
-        key=lambda file: (HEADLINE_DATASET not in file.path.parts, str(file.path)),
-        default=None,
-    )
+    files.sort(key=lambda file: (HEADLINE_DATASET not in file.path.parts, str(file.path)))
+    return files[0] if files else None
 
 
 def list_method_summaries(run: Run) -> dict[str, str]:
     """Return the first sentence of the module of each method of the datasets, by its label."""
     # A dictionary keeps the order of tables and drops repeats.
-    names = dict.fromkeys(
-        n for dataset in list_default_datasets(run) for n in method_names(run, dataset)
-    )
+    names = chain.from_iterable(method_names(run, d) for d in list_default_datasets(run))
     texts = {}
-    for kind in map(method, names):
+    for kind in map(method, dict.fromkeys(names)):
         # The first paragraph of a module's docstring is one sentence.
         text = getdoc(import_module(kind.__module__)) or ""
         texts[kind.look.label] = text.partition("\n\n")[0].replace("\n", " ")

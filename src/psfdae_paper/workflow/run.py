@@ -231,10 +231,8 @@ def require_same_run(run: Run) -> None:
         earlier_words, words = [f"preset={earlier_run['preset']}", *earlier_words], run.overrides
     missing = " ".join(word for word in earlier_words if word not in words)
     additional = " ".join(word for word in words if word not in earlier_words)
-    if missing or additional:
-        differences = [f"with {missing}"] * bool(missing) + [f"without {additional}"] * bool(
-            additional
-        )
+    texts = {"with": missing, "without": additional}
+    if differences := [f"{word} {text}" for word, text in texts.items() if text]:
         purpose = "to replace it" if words else "to go on with it"
         raise ConfigError(
             f"{run.results} holds a finished run {' and '.join(differences)}; name a folder for "

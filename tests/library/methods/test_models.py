@@ -16,7 +16,7 @@ import torch
 from psfdae.base.files import ProductError
 from psfdae.methods import all_methods
 from psfdae.methods.dae import Dae as Fitted
-from psfdae.methods.interface import TrainingSet
+from psfdae.methods.interface import FitError, TrainingSet
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.methods.metrics import mse
 from psfdae.methods.networks import dae as dae_network
@@ -33,8 +33,7 @@ from psfdae_paper.methods import pca_som
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 from psfdae_paper.source import SOURCES
 
-SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
-BASELINE = {key: value for key, value in SOM.items() if key != "seed"}
+BASELINE = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5}
 BASELINE |= {"components": 4, "threads": 1}
 DAE = DaeSettings(kernels=[5, 3, 1, 3, 5], widths=[4] * 4, init="he", scale="mean")
 TRAIN = Train(
@@ -134,15 +133,17 @@ def test_baseline_recovers_separate_classes():
     classes = rng.random((3, 8, 8))
     label = np.arange(300) % 3
     images = classes[label] + 0.01 * rng.normal(size=(300, 8, 8))
-    fitted = fit_pca_som(images, components=4, **SOM)
+    fitted = fit_pca_som(images, Baseline(**BASELINE), seed=1)
     assert mse(fitted.predict(images), classes[label]).max() < 1e-4
     assert np.isfinite(fitted.psf).all()  # of 16 nodes, those without stars are left out
 
 
-def test_baseline_refuses_more_components_than_stars_and_stars_that_are_not_finite(gaussian_stars):
-    with pytest.raises(ValueError, match="components = 30"):
-        fit_pca_som(gaussian_stars[:20], components=30, **SOM)
-    fitted = fit_pca_som(gaussian_stars, components=4, **SOM)
+def test_baseline_refuses_more_components_than_stars_and_stars_that_are_not_finite(
+    data, gaussian_stars
+):
+    with pytest.raises(FitError, match=r"components = 9999: must be at most \d+, the number"):
+        PcaSom.fit(data, Baseline(**BASELINE | {"components": 9999}))
+    fitted = fit_pca_som(gaussian_stars, Baseline(**BASELINE), seed=1)
     broken = gaussian_stars.copy()
     broken[7, 0, 0], broken[9, 3, 3] = np.nan, np.inf
     with pytest.raises(ValueError, match="not finite, the first is number 7"):
@@ -152,9 +153,9 @@ def test_baseline_refuses_more_components_than_stars_and_stars_that_are_not_fini
 def test_map_of_mixed_levels_depends_on_the_seed_and_ignores_the_level(data, monkeypatch):
     seeds, settings = [], Baseline(**BASELINE, per_level=False)
 
-    def begun(images, *, seed, **options):
+    def begun(images, settings, seed):
         seeds.append(seed)
-        return fit_pca_som(images, seed=seed, **options)
+        return fit_pca_som(images, settings, seed)
 
     monkeypatch.setattr(pca_som, "fit_pca_som", begun)
     fits = [PcaSom.fit(replace(data, seed=seed), settings) for seed in (1, 2, 1)]

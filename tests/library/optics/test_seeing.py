@@ -124,8 +124,8 @@ def test_repeated_wings_do_not_reach_the_stamps():
 
 
 def test_framed_stars_are_wider_and_as_bright():
-    sharp, _ = propagation_of(load([OWN_TELESCOPE, "grid.points=3"])).framed(32)
-    blurred, peak = propagation_of(load(words_of(kind="gaussian", fwhm_arcsec=3))).framed(32)
+    sharp, _ = propagation_of(load([OWN_TELESCOPE, "grid.points=3"])).frame(32)
+    blurred, peak = propagation_of(load(words_of(kind="gaussian", fwhm_arcsec=3))).frame(32)
     assert (blurred.max(axis=(1, 2)) < 0.6 * sharp.max(axis=(1, 2))).all()
     assert blurred.sum(axis=(1, 2)) == pytest.approx(sharp.sum(axis=(1, 2)), abs=0.02)
     assert np.abs(peak).max() < 8

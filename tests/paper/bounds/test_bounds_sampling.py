@@ -37,7 +37,7 @@ def simulated(model, z, field):
     """Stamps at all jitters and brightest pixels, framed by the simulator itself."""
     source = seidel_wavefronts(model.mean + model.sd * z, model.field[field])
     propagation = Propagation(source, model.telescope, model.optics, model.framing, 24)
-    framed, peak = propagation.framed(model.framing.stamp_px + 2)
+    framed, peak = propagation.frame(model.framing.stamp_px + 2)
     cuts = [crop_jittered(framed, np.array(jitter), 1) for jitter in list_jitters(1)]
     return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1), peak
 

@@ -7,7 +7,7 @@ import pytest
 from minisom import MiniSom
 from sklearn.decomposition import PCA
 
-from psfdae_paper.methods.pca_som import principal_axes, train_map
+from psfdae_paper.methods.pca_som import Baseline, principal_axes, train_map
 
 
 @pytest.fixture(scope="module")
@@ -30,5 +30,5 @@ def test_the_map_is_minisom_s_to_the_last_bit(points):
     minisom = MiniSom(5, 4, 6, random_seed=3, **settings)
     minisom.random_weights_init(points)
     minisom.train(points, 3, random_order=True, use_epochs=True)
-    nodes = train_map(points, (5, 4), 3, seed=3, **settings)
+    nodes = train_map(points, Baseline(rows=5, columns=4, epochs=3, **settings), seed=3)
     assert (nodes == minisom.get_weights().reshape(20, 6)).all()

@@ -21,8 +21,6 @@ from astropy.table import Table
 from psfdae import api
 from psfdae.base.files import write_csv, write_text
 from psfdae.base.reading import read_table
-from psfdae.photometry import image_photometry
-from psfdae.report import validation
 from psfdae_paper.evaluation.night import LIMITS, add_verdicts, night_page, read_night
 from psfdae_paper.stages import night as night_stage
 from psfdae_paper.stages.night import (
@@ -345,9 +343,9 @@ def test_a_night_killed_between_any_two_files_is_the_same_once_repeated(tmp_path
     )
     monkeypatch.setattr(night_stage, "bright_stars", lambda row: FewStars(1.5))
     monkeypatch.setattr(night_stage, "fit_image", lambda stars, start: model)
-    monkeypatch.setattr(validation, "validate", lambda model, stars: page)
+    monkeypatch.setattr(night_stage, "validate", lambda model, stars: page)
     photometry = SimpleNamespace(table=table)
-    monkeypatch.setattr(image_photometry, "measure_all_stars", lambda *a, **kw: photometry)
+    monkeypatch.setattr(night_stage, "measure_all_stars", lambda *a, **kw: photometry)
 
     def run(out):
         night_images(tmp_path / "rows.csv", out / "images", out / "part.csv")

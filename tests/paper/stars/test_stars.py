@@ -78,7 +78,7 @@ def test_ties_go_to_the_first_pixel_in_row_order():
 def test_brightest_pixel_lands_at_half_the_stamp_plus_jitter(templates):
     propagation, peak = templates
     assert np.abs(peak + 0.5).max() == pytest.approx(14, abs=1)  # as designed
-    stamps, _ = propagation.framed(16, np.array([[1, -1]]))
+    stamps, _ = propagation.frame(16, np.array([[1, -1]]))
     assert {brightest_pixel(stamp, 1e-4) for stamp in stamps} == {(9, 7)}
 
 
