@@ -90,10 +90,10 @@ def predict_command(
     if all_extensions:
         # Images are worked on side by side, each by one thread, with its own model and outputs.
         jobs = {}
-        for name, image_options in options_by_image(stars, options).items():
+        for image, image_options in options_by_image(stars, options).items():
             changes = {"options": image_options, "all_extensions": False, "threads": 1}
-            outputs = {"plot": name_image_path(plot, name), "out": name_image_path(out, name)}
-            jobs[name] = {**arguments, **changes, "model": find_bundle(model, name), **outputs}
+            outputs = {"plot": name_image_path(plot, image), "out": name_image_path(out, image)}
+            jobs[image] = {**arguments, **changes, "model": find_bundle(model, image), **outputs}
         run_for_images(predict_command, jobs, stars)
         return ""
     # Check all that can be checked without reading pixels: inputs, outputs, and the model.
@@ -216,7 +216,7 @@ def write_prediction(
     star_index, unflagged_count, offsets = 0, 0, []
     # Header cards: the file, its pixel scale, the star list, and what is known of the detector.
     scale_note = ", assumed" if observation.scale_assumed else ""
-    catalogue = observation.catalogue and observation.catalogue.name
+    catalogue = None if observation.catalogue is None else observation.catalogue.name
     known_cards: list[Card] = [
         ("CATALOG", catalogue, "star list"),
         ("GAIN", observation.gain, "electrons per count"),
