@@ -284,16 +284,14 @@ def test_a_truncated_archive_leaves_nothing(archived, tmp_path, share):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
-def test_an_error_of_the_machine_is_no_damage_of_the_archive(
-    archived, tmp_path, monkeypatch, number
-):
+def test_machine_errors_are_no_damage(archived, tmp_path, monkeypatch, number):
     def fail(*args, **kwargs):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(tarfile.TarFile, "extract", fail)
-    with pytest.raises(ArchiveError, match=os.strerror(number)) as caught:
+    with pytest.raises(ArchiveError, match=os.strerror(number)) as error:
         fetch(archived, tmp_path / "fetched")
-    assert "cannot be unpacked" in str(caught.value) and "damaged" not in str(caught.value)
+    assert "cannot be unpacked" in str(error.value) and "damaged" not in str(error.value)
     assert not [*tmp_path.glob("*fetch*")]
 
 

@@ -251,7 +251,7 @@ def test_errors_of_predictions_include_noise_that_pixels_share(model, image, kin
 @pytest.mark.parametrize("kind", SHARED)
 @pytest.mark.parametrize("map_kind", [None, "error", "weight"])
 @pytest.mark.parametrize("is_detected", [True, False])
-def test_a_property_of_an_image_is_said_once(image, kind, map_kind, is_detected):
+def test_each_property_is_said_once(image, kind, map_kind, is_detected):
     """Sentences of the camera, the sky and the layers do not repeat each other."""
     axis, rng = np.arange(16.0, len(image) - 16, 20), np.random.default_rng(3)
     place = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
