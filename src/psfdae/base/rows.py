@@ -10,13 +10,22 @@ import numpy as np
 
 
 class Rows:
-    """Base of dataclasses whose fields are all arrays with a row for each item."""
+    """Base of dataclasses whose fields have a row for each item.
+
+    A field is an array, another such object, or None.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def select(self, rows: np.ndarray | slice) -> Self:
         """Return some of the items, selected by indices, a mask or a slice."""
-        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+        columns = [getattr(self, field.name) for field in fields(self)]
+        return type(self)(*(_select(column, rows) for column in columns))
+
+    def split(self, size: int) -> list[Self]:
+        """Return the items in parts of `size`, the last one smaller; no items are one part."""
+        count = len(getattr(self, fields(self)[0].name))
+        return [self.select(slice(start, start + size)) for start in range(0, max(count, 1), size)]
 
     def put(self, rows: np.ndarray, replacement: Self) -> None:
         """Replace the items at these indices; the arrays are changed in place."""
@@ -30,3 +39,10 @@ class Rows:
             return parts[0]
         columns = ([getattr(part, field.name) for part in parts] for field in fields(cls))
         return cls(*map(np.concatenate, columns))
+
+
+def _select(column: Any, rows: np.ndarray | slice) -> Any:
+    """Return some rows of an array or of `Rows`; None of None."""
+    if column is None:
+        return None
+    return column.select(rows) if isinstance(column, Rows) else column[rows]

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import combinations, pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from psfdae.base.rows import Rows
 from psfdae.denoise.bundle import Bundle
 from psfdae.denoise.error_model import ErrorModel, mahalanobis
 from psfdae.denoise.flux_model import NOISE_FLOOR, FluxModel, Photometry, is_faint
@@ -112,7 +113,8 @@ class CentredStars(NamedTuple):
         return data, noise, is_unusable
 
 
-class DenoisedStars(NamedTuple):
+@dataclass(frozen=True)
+class DenoisedStars(Rows):
     """PSFs of stars as a method gives them.
 
     Attributes
@@ -141,14 +143,6 @@ class DenoisedStars(NamedTuple):
     outlier_score: np.ndarray
     centre: np.ndarray
     covariance: np.ndarray
-
-    def part(self, rows: slice) -> DenoisedStars:
-        """Return some of the stars."""
-        values: dict[str, Any] = {
-            name: array[rows] if isinstance(array, np.ndarray) else array
-            for name, array in self._asdict().items()
-        }
-        return DenoisedStars(**values | {"photometry": self.photometry.select(rows)})
 
     def centre_columns(self) -> dict[str, np.ndarray]:
         """Return the columns on centres, and on all errors but the flux error.
@@ -196,11 +190,6 @@ class Denoiser(ABC):
         calibration = bundle.info.config.get("stars", {}).get("calibration_stars", {})
         self._centring_px = float(calibration.get("centring_px") or 0.0)
 
-    def blocks(self, stars: Stamps) -> list[Stamps]:
-        """Return stars in parts of `block_size`."""
-        size = self.block_size
-        return [stars.part(slice(start, start + size)) for start in range(0, len(stars), size)]
-
     def denoise(self, stars: Stamps, fixed: bool = False) -> Prediction:
         """Return the PSFs of at most `block_size` stars, whose listed centres are exact if `fixed`.
 
@@ -219,8 +208,7 @@ class Denoiser(ABC):
         # Unusable stars are NaN or infinite on the way, and are flagged.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             # 2048 stars at a time are measured and described: their arrays fit in memory.
-            parts = [stars.part(slice(start, start + 2048)) for start in range(0, len(stars), 2048)]
-            centred_stars = [self._centre(part, fixed) for part in parts]
+            centred_stars = [self._centre(part, fixed) for part in stars.split(2048)]
             predictions = map(self._predict, centred_stars, self._denoise(centred_stars))
             return Prediction.joined([*predictions]).of(slice(count))
 
@@ -273,10 +261,10 @@ class Denoiser(ABC):
         """Return the PSFs in the unit of the stamps, with errors, χ², shapes and flags."""
         info, errors = self.bundle.info, self.bundle.errors
         stars, flags = centred_stars.stars, centred_stars.flags
-        psf, sigma, photometry, has_no_flux = denoised_stars[:4]
+        psf, sigma, photometry = denoised_stars.psf, denoised_stars.sigma, denoised_stars.photometry
         # Noise divided by the flux, as in the training: errors and limits depend on it. PSFs and
         # fluxes are sums of pixels, which have more noise where pixels share it.
-        noise = photometry.noise / np.where(has_no_flux, np.nan, photometry.flux)
+        noise = photometry.noise / np.where(denoised_stars.has_no_flux, np.nan, photometry.flux)
         noise *= stars.noise_correlation
         shapes = measure_shapes(psf)
         # S/N of a matched filter: √(Σ psf²) F/σ.
@@ -408,7 +396,7 @@ class StampDenoiser(Denoiser):
         ends = np.cumsum([0, *(len(part.stars) for part in centred_stars)])
         unknown = np.full((len(psf), 2), np.nan), np.full((len(psf), 4, 4), np.nan)
         denoised_stars = DenoisedStars(psf, sigma, photometry, has_no_flux, score, *unknown)
-        return [denoised_stars.part(slice(*rows)) for rows in pairwise(ends)]
+        return [denoised_stars.select(slice(*rows)) for rows in pairwise(ends)]
 
     def _normalise(
         self, photometry: Photometry, has_no_flux: np.ndarray

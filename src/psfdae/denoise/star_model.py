@@ -195,7 +195,7 @@ class StarModel(FieldPsfs):
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = make_stamps(stamps, side, self.name, numbers, masks, position, centre)
         # Blocks of stars, side by side; each is denoised as if it were alone.
-        blocks = self.denoiser.blocks(stars) or [stars]
+        blocks = stars.split(self.denoiser.block_size)
         threads = min(threads or available_cores(), len(blocks))
         with use_one_thread_each():
             parts = run_parallel(lambda block: self.denoiser.denoise(block, fixed), blocks, threads)
@@ -214,7 +214,7 @@ class StarModel(FieldPsfs):
         size = denoiser.block_size
 
         def predict_chunk(stamps: Stamps) -> Prediction:
-            blocks = denoiser.blocks(stamps)
+            blocks = stamps.split(size)
             return Prediction.joined([denoiser.denoise(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(self.max_stars_read, 4 * size)))

@@ -105,7 +105,7 @@ class Candidates:
         bright = [replace(b, row=b.row + n) for b, n in zip(bright, starts, strict=False)]
         names = [field.name for field in fields(cls) if field.name != "bright"]
         columns = {name: np.concatenate([getattr(c, name) for c in several]) for name in names}
-        return cls(**columns, bright=BrightStars.concatenate(bright))
+        return cls(**columns, bright=BrightStars.join(bright))
 
     def require(self, path: Path, stars_min: int, remarks: Sequence[str] = ()) -> None:
         """Raise CalibrationStarsError if the image has fewer good stars.
@@ -179,7 +179,7 @@ def collect(
             parts.append(measure_stamps(stamps, settings, framing, observation))
             advance(len(stamps.data))
     star_columns = {name: np.concatenate([part[name] for part, _ in parts]) for name in parts[0][0]}
-    bright = BrightStars.concatenate([stars for _, stars in parts])
+    bright = BrightStars.join([stars for _, stars in parts])
     # Stars that meet all criteria of single stars, with their rows in the list.
     verdict, position = star_columns["verdict"], star_columns["position"]
     bright = replace(bright, row=np.flatnonzero(verdict == Verdict.GOOD))

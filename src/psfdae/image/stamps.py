@@ -6,19 +6,20 @@ and the displacement of each is measured. `psfdae.image.sky` measures their sky.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 from typing import Self
 
 import numpy as np
 
+from psfdae.base.rows import Rows
 from psfdae.image.fits_file import ImageFile
 from psfdae.image.sky import border_scatter
 from psfdae.stars.moments import FWHM_OF_SIGMA
 
 
 @dataclass(frozen=True)
-class Stamps:
+class Stamps(Rows):
     """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and columns of the stars.
 
     Attributes
@@ -69,10 +70,6 @@ class Stamps:
 
     def __len__(self) -> int:
         return len(self.data)
-
-    def part(self, rows: slice) -> Stamps:
-        """Return some of the stars."""
-        return Stamps(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 class StarFlag(IntFlag):

@@ -64,18 +64,12 @@ def wavefront_hdus(wavefronts: Wavefronts, image: str) -> HDUList:
     covariance[np.isfinite(modes["probability"])] = of_modes
     # Images of each star: its PSF with errors, and the residuals of the used pixels.
     psf, psf_error = wavefronts.psf_and_error()
-    sky = wavefronts.measured()["sky"][:, None, None]
-    residual = np.where(
-        wavefronts.stamps.bad | wavefronts.stamps.saturated,
-        np.nan,
-        wavefronts.stamps.data - sky - wavefronts.model,
-    )
     hdus = [primary, table]
     for name, values, comment in (
         ("PSF", psf, "whole light 1, chief ray in the middle"),
         ("UNCERT", psf_error, "standard deviation of PSF"),
         ("MODEL", wavefronts.model, "star without sky, unit of the input"),
-        ("RESIDUAL", residual, "stamp minus sky minus model, NaN where unused"),
+        ("RESIDUAL", wavefronts.residual, "stamp minus sky minus model, NaN where unused"),
         ("COVAR", covariance, "of the coefficients, squared waves; row by row"),
     ):
         hdu = fits.ImageHDU(values.astype(np.float32), name=name)

@@ -39,11 +39,9 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
         model_waves = joint.model.coefficients(joint.value)
     model = pupil_opd(wavefronts, stars, model_waves[stars])
     # Residuals in units of the sky noise, minus the median of each stamp.
-    stamps, photons = wavefronts.stamps, wavefronts.search.photons
-    residual = stamps.data - photons.sky_level[:, None, None] - wavefronts.model
-    residual[stamps.bad | stamps.saturated] = np.nan
+    residual = wavefronts.residual[stars]
     residual -= np.nanmedian(residual, axis=(1, 2), keepdims=True)
-    residual = (residual / photons.sky_noise[:, None, None])[stars]
+    residual /= wavefronts.search.photons.sky_noise[stars, None, None]
     # The colour scale ends at the 98th percentile: otherwise it would only show the rim.
     peak = float(np.nanpercentile(np.abs([star_opd, model]), 98)) if len(stars) else 1.0
     model_name = "fitted telescope" if joint else "prior's mean"

@@ -334,6 +334,13 @@ class Wavefronts:
             model[star] = (light[:, None, None] * images).mean(axis=0)
         return model
 
+    @property
+    def residual(self) -> np.ndarray:
+        """Stamps minus sky and model, in their unit, (n, d, d); NaN in pixels that are not used."""
+        sky = self.measured()["sky"][:, None, None]
+        is_unused = self.stamps.bad | self.stamps.saturated
+        return np.where(is_unused, np.nan, self.stamps.data - sky - self.model)
+
     def _pupil_modes(self, row: int, place_px: np.ndarray) -> np.ndarray:
         """Return mode coefficients (s, J + 2) of the draws of `star[row]` at positions (s, 2)."""
         stars = np.full(len(place_px), self.star[row])

@@ -6,13 +6,13 @@ same stars aligned or cut to frames, and the coordinates on which the PSF may de
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from psfdae.base.files import Product
+from psfdae.base.rows import Rows
 from psfdae.stars.moments import shift_stamps
 
 
@@ -29,7 +29,7 @@ def psf_coordinates(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) 
 
 
 @dataclass(frozen=True)
-class BrightStars:
+class BrightStars(Rows):
     """Bright stars with the pixels around them.
 
     Attributes
@@ -93,21 +93,9 @@ class BrightStars:
         arrays["noise"] = stars["noise"] * flux
         return cls(**arrays, centre=np.full(arrays["position"].shape, np.nan))
 
-    @classmethod
-    def concatenate(cls, several: Sequence[BrightStars]) -> BrightStars:
-        """Concatenate sets of stars whose stamps have the same margin."""
-        # Attribute by attribute, in the order of the fields.
-        columns = ([getattr(stars, f.name) for stars in several] for f in fields(cls))
-        return cls(*map(np.concatenate, columns))
-
     def __len__(self) -> int:
         """Return the number of stars."""
         return len(self.stamps)
-
-    def select(self, rows: np.ndarray) -> BrightStars:
-        """Return some of the stars, selected by a mask or by indices."""
-        # The same rows of every attribute.
-        return BrightStars(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @property
     def coordinates(self) -> np.ndarray:
