@@ -130,20 +130,15 @@ class Photometer:
                 if estimate is None:
                     estimate = robust_flux(x.reshape(-1, side, side), model)
                     blind_estimate = estimate if blind else blind_estimate
-                self._overwrite(photometry, group, estimate, sky[group], given_stars)
+                given = given_stars.select(group)
+                photometry.put(group, self._complete(estimate, sky[group], given))
 
-    def _overwrite(
-        self,
-        photometry: Photometry,
-        group: np.ndarray,
-        padded_estimate: Photometry,
-        sky: np.ndarray,
-        given_stars: Stamps,
-    ) -> None:
-        """Overwrite rows `group` of a photometry by an estimate, of which they are the first."""
+    def _complete(self, padded_estimate: Photometry, sky: np.ndarray, given: Stamps) -> Photometry:
+        """Return the photometry of stars, the first of an estimate, with what is given of them."""
         # A flux that is given counts, and so do the repaired pixels and their noise.
-        count, estimate = group.size, padded_estimate.select(slice(group.size))
-        known_flux, known_noise = given_stars.flux[group], given_stars.noise[group]
+        count = len(given.flux)
+        estimate = padded_estimate.select(slice(count))
+        known_flux, known_noise = given.flux, given.noise
         has_flux, filled_pixels = np.isfinite(known_flux), estimate.images.reshape(count, -1)
         fitted_flux, fit_flags = estimate.flux, estimate.flags
         is_fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
@@ -158,7 +153,7 @@ class Photometer:
         # The sky that is left, b = mean(x) − F/P, and images of flux 1 without it.
         flux_per_pixel = np.nan_to_num(fitted_flux) / filled_pixels.shape[1]
         residual_sky = filled_pixels.mean(axis=1) - flux_per_pixel
-        residual_sky = np.where(np.isfinite(given_stars.background[group]), 0.0, residual_sky)
+        residual_sky = np.where(np.isfinite(given.background), 0.0, residual_sky)
         images = (filled_pixels - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
         images[is_lost] = 0.0
         # The noise as of other stars, by the pixels of the border that were used.
@@ -171,8 +166,8 @@ class Photometer:
         fit = self.leading.fit(known_images, sky_known, unit, unknown_noise, is_used)
         noise = fit.noise[:count] * flux
         noise = np.where(is_lost, estimate.noise, noise)
-        # Rows of the photometry; given values stay unchanged.
-        replacement = Photometry(
+        # Given values stay unchanged.
+        return Photometry(
             flux=flux,
             flux_error=np.where(has_flux, np.nan, estimate.flux_error),
             background=sky + np.where(is_fitted, residual_sky, 0.0),
@@ -181,4 +176,3 @@ class Photometer:
             is_used=estimate.is_used,
             flags=flags,
         )
-        photometry.put(group, replacement)

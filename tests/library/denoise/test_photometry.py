@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 from prediction_stars import observe
+from psfdae.base.rows import Rows
 from psfdae.denoise import flux_model as module
 from psfdae.denoise.denoiser import FieldDenoiser
 from psfdae.denoise.error_model import ErrorModel
@@ -136,13 +137,22 @@ def whole_model(gaussian_stars):
     return FluxModel.fit(gaussian_stars)
 
 
+@dataclass(frozen=True)
+class Given(Rows):
+    """What `Photometer` reads of stamps."""
+
+    flux: np.ndarray
+    background: np.ndarray
+    noise: np.ndarray
+
+
 def measure(model, stamps, start, bad=False, **stated):
     """Photometry of stamps of which some is known."""
     unknown = dict.fromkeys(("flux", "background", "noise"), np.nan)
     values = {name: np.full(len(stamps), value) for name, value in (unknown | stated).items()}
     bad = np.zeros(stamps.shape, dtype=bool) | bad
     start = np.full(len(stamps), start)
-    return Photometer(model, 48).measure(stamps, bad, start, SimpleNamespace(**values))
+    return Photometer(model, 48).measure(stamps, bad, start, Given(**values))
 
 
 @pytest.mark.parametrize("sky_known", [True, False])
