@@ -181,7 +181,9 @@ class ErrorModel:
         values |= {name: float(arrays[name]) for name in ("distance_limit", "noise_floor")}
         # Ten numbers of the model's own errors; the last six are middle and growth of the flux's.
         table = values.pop("model")
-        return cls(**values, model_errors=ModelErrors(*table[:4].tolist(), table[4:6], table[6:]))
+        numbers = dict(zip(ModelErrors._fields, table[:4].tolist(), strict=False))
+        model_errors = ModelErrors(**numbers, middle=table[4:6], growth=table[6:])
+        return cls(**values, model_errors=model_errors)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all numbers as arrays: maps in float32, others in float64; no array for None."""

@@ -301,8 +301,9 @@ class Sampling(Protocol):
     product_cost: float
     """Measured time for a product of polynomials, over the time for a single direction."""
 
-    propagator: StampPropagator | None
-    """Faster propagation of stamps without derivatives, if there is one."""
+    @property
+    def propagator(self) -> StampPropagator | None:
+        """Faster propagation of stamps without derivatives, if there is one."""
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Propagate rows of the pupil, times P_a(x) for all degrees a, to m points along x.
