@@ -6,6 +6,10 @@ Student's t distributions. The mixture is adapted to its own draws (`psfdae_pape
 and the draws of all rounds are weighted by prior × likelihood over the density of all rounds
 together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
 brightest pixel the simulator would not frame at o get weight 0.
+
+The Markov chains of `psfdae.sensing.sampling` cannot replace it: evidence for a bound needs weights
+of independent draws, in parts and with an effective size. Nor can it replace the chains: in the
+many parameters of a star of unknown position, flux and sky, few draws get all the weight.
 """
 
 from __future__ import annotations

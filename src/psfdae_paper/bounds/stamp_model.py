@@ -2,6 +2,11 @@
 
 The input is standardised Seidel coefficients, fields and stamp offsets, the output propagated
 stamps and their derivatives by the coefficients. All searches and samples of a posterior use them.
+
+Propagation and derivatives are the library's (`psfdae.optics`). The parameters are not the
+parameters of `psfdae.sensing.stars.StarOptics`: a simulated stamp has the sum 1, stands at whole
+pixels about its brightest one, and is moved by distortion; a star of an image has a position, a
+flux and a sky of its own.
 """
 
 from __future__ import annotations
