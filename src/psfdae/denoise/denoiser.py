@@ -276,9 +276,8 @@ class Denoiser(ABC):
         # F psf ± F w, with the half-width w of the case of each star.
         half_width, ratio95, flux_scale = errors.compute_half_widths(psf, sigma, noise, stars)
         psf *= flux
-        residual = (centred_stars.stamps - photometry.background[:, None, None]).astype(
-            np.float32
-        ) - psf
+        stamps = centred_stars.stamps - photometry.background[:, None, None]
+        residual = stamps.astype(np.float32) - psf
         # Pixels that were repaired have no residual.
         residual[~photometry.is_used] = np.nan
         flux_sigma = None if sigma is None else sigma * photometry.flux[:, None, None]

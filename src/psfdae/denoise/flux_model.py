@@ -115,14 +115,18 @@ class FluxModel:
         # units of the flux squared: C + 10⁴ c cᵀ, with the constant c of length 1.
         free_sky_variance = 1e4
         constant = np.full((self.mean.size, 1), self.mean.size**-0.5)
-        # All but the rest of the covariance, which is the same along all directions, lives in the
-        # space of basis and constant.
-        space = np.linalg.qr(np.hstack([self.basis, constant]))[0]
-        modes, sky = space.T @ self.basis, space.T @ constant
-        inside = (modes * (self.variance - self.other_variance)) @ modes.T
-        variance, turn = np.linalg.eigh(inside + free_sky_variance * sky @ sky.T)
-        variance = np.maximum(variance + self.other_variance, 0.0)
-        return replace(self, basis=space @ turn, variance=variance)
+        if not self.is_complete:
+            # All but the rest of the covariance, which is the same along all directions, lives in
+            # the space of basis and constant.
+            space = np.linalg.qr(np.hstack([self.basis, constant]))[0]
+            modes, sky = space.T @ self.basis, space.T @ constant
+            inside = (modes * (self.variance - self.other_variance)) @ modes.T
+            variance, turn = np.linalg.eigh(inside + free_sky_variance * sky @ sky.T)
+            variance = np.maximum(variance + self.other_variance, 0.0)
+            return replace(self, basis=space @ turn, variance=variance)
+        covariance = (self.basis * self.variance) @ self.basis.T
+        variance, basis = np.linalg.eigh(covariance + free_sky_variance * constant @ constant.T)
+        return replace(self, basis=basis, variance=np.maximum(variance, 0.0))
 
     def average_variance_beyond(self, components: int) -> float:
         """Return the mean variance along all directions but so many leading eigenvectors."""
