@@ -130,15 +130,15 @@ class Photometer:
                 if estimate is None:
                     estimate = robust_flux(x.reshape(-1, side, side), model)
                     blind_estimate = estimate if blind else blind_estimate
-                given = given_stars.select(group)
-                photometry.put(group, self._complete(estimate, sky[group], given))
+                group_stars = given_stars.select(group)
+                photometry.put(group, self._complete(estimate, sky[group], group_stars))
 
-    def _complete(self, padded_estimate: Photometry, sky: np.ndarray, given: Stamps) -> Photometry:
-        """Return the photometry of stars, the first of an estimate, with what is given of them."""
+    def _complete(self, padded_estimate: Photometry, sky: np.ndarray, stars: Stamps) -> Photometry:
+        """Return the photometry of stars, the first of an estimate; their given values are kept."""
         # A flux that is given counts, and so do the repaired pixels and their noise.
-        count = len(given.flux)
+        count = len(stars)
         estimate = padded_estimate.select(slice(count))
-        known_flux, known_noise = given.flux, given.noise
+        known_flux, known_noise = stars.flux, stars.noise
         has_flux, filled_pixels = np.isfinite(known_flux), estimate.images.reshape(count, -1)
         fitted_flux, fit_flags = estimate.flux, estimate.flags
         is_fitted, flux = np.isfinite(fitted_flux), np.where(has_flux, known_flux, fitted_flux)
@@ -153,7 +153,7 @@ class Photometer:
         # The sky that is left, b = mean(x) − F/P, and images of flux 1 without it.
         flux_per_pixel = np.nan_to_num(fitted_flux) / filled_pixels.shape[1]
         residual_sky = filled_pixels.mean(axis=1) - flux_per_pixel
-        residual_sky = np.where(np.isfinite(given.background), 0.0, residual_sky)
+        residual_sky = np.where(np.isfinite(stars.background), 0.0, residual_sky)
         images = (filled_pixels - residual_sky[:, None]) / np.where(is_lost, 1.0, flux)[:, None]
         images[is_lost] = 0.0
         # The noise as of other stars, by the pixels of the border that were used.

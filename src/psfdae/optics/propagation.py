@@ -252,8 +252,8 @@ class StampPropagator:
         # Odd over x: products of real and imaginary parts across cosines and sines in x. They are
         # even over y for equal parts in y, and odd for different ones.
         (cos_re, cos_im), (sin_re, sin_im) = field[0].swapaxes(0, 1), field[1].swapaxes(0, 1)
-        swapped = (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,)))
-        for parity, (re, im) in enumerate(((sin_re, sin_im), swapped)):
+        exchanged_parts = (xp.flip(sin_re, (0,)), xp.flip(sin_im, (0,)))
+        for parity, (re, im) in enumerate(((sin_re, sin_im), exchanged_parts)):
             xp.multiply(cos_re, im, out=half[0])
             xp.multiply(cos_im, re, out=half[1])
             intensity[1, parity] = half[0].sum(0) - half[1].sum(0)

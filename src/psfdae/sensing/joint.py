@@ -26,7 +26,7 @@ from psfdae.sensing.climbing import (
     combine_images,
     poisson_information,
 )
-from psfdae.sensing.modes import squared_distance
+from psfdae.sensing.modes import compute_squared_distance
 from psfdae.sensing.stars import MAX_Z, SensingError, StarModes, StarOptics, WavefrontSearch
 from psfdae.telescope.field import TelescopeModel
 from psfdae.telescope.raytracing import RayTracingError
@@ -183,8 +183,8 @@ class TelescopePosterior:
                 deviance, star_score, star_information = self.evaluate_stars(values)
                 # The numbers are shared by all stars; the four parameters of each star have rows of
                 # their own.
-                combined = combine_images(star_score[None], star_information[None], q)
-                likelihood = deviance.sum(keepdims=True), *combined
+                totals = combine_images(star_score[None], star_information[None], q)
+                likelihood = deviance.sum(keepdims=True), *totals
                 posterior = add_normal_prior(likelihood, values[None], precision)
                 (height[row],), (score[row],), (information[row],) = posterior
         return height, score, information
@@ -350,7 +350,7 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
         # Squared Mahalanobis distance of each mode; in this order, the first mode of each star is
         # the nearest.
         gap = mode_coefficients - posterior.coefficients(t)[row]
-        order = np.lexsort((squared_distance(gap[:, None], covariance)[:, 0], modes.star))
+        order = np.lexsort((compute_squared_distance(gap[:, None], covariance)[:, 0], modes.star))
         nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
         # Gauss–Newton step of the numbers, with their prior.
         slopes = posterior.slopes(t)

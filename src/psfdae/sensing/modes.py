@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def squared_distance(gap: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def compute_squared_distance(gap: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the squares of the Mahalanobis distances gᵀ C⁻¹ g of gaps g from M modes.
 
     Parameters
@@ -55,7 +55,7 @@ def merge_modes(
     for mode in np.argsort(-evidence, kind="stable").tolist():
         better_modes = distinct.setdefault(int(group[mode]), [])
         gap = (position[mode] - position[better_modes])[:, None]
-        is_near = squared_distance(gap, covariance[better_modes])[:, 0] < 1.0
+        is_near = compute_squared_distance(gap, covariance[better_modes])[:, 0] < 1.0
         if is_near.any():
             representative[mode] = better_modes[is_near.argmax()]
         else:

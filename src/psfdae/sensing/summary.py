@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.sensing.modes import squared_distance
+from psfdae.sensing.modes import compute_squared_distance
 from psfdae.sensing.stars import StarModes
 
 
@@ -31,7 +31,7 @@ def nearest_modes(draws: np.ndarray, modes: StarModes) -> np.ndarray:
         # Distances of all draws from all modes of the star.
         numbers = np.flatnonzero(modes.star == star)
         gap = draws[row] - modes.parameters[numbers][:, None]
-        distance = squared_distance(gap, modes.covariance[numbers])
+        distance = compute_squared_distance(gap, modes.covariance[numbers])
         nearest[row] = numbers[distance.argmin(axis=0)]
     return nearest
 

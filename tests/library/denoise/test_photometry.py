@@ -139,11 +139,14 @@ def whole_model(gaussian_stars):
 
 @dataclass(frozen=True)
 class Given(Rows):
-    """What `Photometer` reads of stamps."""
+    """The given values of stars that `Photometer` reads."""
 
     flux: np.ndarray
     background: np.ndarray
     noise: np.ndarray
+
+    def __len__(self):
+        return len(self.flux)
 
 
 def measure(model, stamps, start, bad=False, **stated):

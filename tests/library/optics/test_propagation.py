@@ -81,6 +81,16 @@ def test_offset_looks_at_that_place(pupil):
     assert offset_stamp == pytest.approx(wide_stamp[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
 
 
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_stamps_do_not_depend_on_the_batches_before(pupil, backend):
+    """Scratch space is kept between batches of any size."""
+    opd = opd_of(np.linspace(0.1, 0.5, 5)[:, None] * COMATIC, pupil)
+    kernel = StampPropagator(pupil, 16, 0.88, backend=backend)
+    alone = [kernel(waves[None])[0] for waves in opd]
+    assert kernel(opd) == pytest.approx(np.array(alone), abs=1e-15)
+    assert kernel(opd[3:4])[0].tobytes() == alone[3].tobytes()
+
+
 def test_backends_and_precisions_agree(pupil):
     opd = opd_of(np.stack([0.2 * COMATIC, 0.4 * COMATIC]), pupil)
     offset = np.array([[3, -2], [0, 7]])

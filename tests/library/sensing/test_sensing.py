@@ -20,8 +20,9 @@ from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening,
 from psfdae.optics.wavefronts import zernike_images
 from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
-from psfdae.sensing.climbing import Steps, climb, poisson_information
+from psfdae.sensing.climbing import Steps, add_normal_prior, climb, poisson_information
 from psfdae.sensing.joint import TelescopePosterior, twin_numbers
+from psfdae.sensing.modes import compute_squared_distance, merge_modes
 from psfdae.sensing.plot import bright_separate_stars
 from psfdae.sensing.results import build_stamps
 from psfdae.sensing.sampling import Chains, sample_around
@@ -87,6 +88,37 @@ def test_deviance_is_the_log_likelihood_that_is_missing():
     deviance = poisson_information(counts, mean, np.empty((1, 0, 3)))[0]
     expected = 2 * (counts * np.log(counts / mean) - counts + mean).sum()
     assert deviance == pytest.approx(expected)
+
+
+def test_slope_and_information_of_a_posterior_are_derivatives_of_its_height():
+    """The likelihood is exp(−½ Σ aᵢ xᵢ²), the priors normal with σ = 1 and 2, and flat."""
+    curvature, precision = np.array([3.0, 0.5, 2.0]), np.array([1.0, 0.25, 0.0])
+
+    def evaluate(x):
+        information = np.tile(np.diag(curvature), (len(x), 1, 1))
+        likelihood = (curvature * x**2).sum(axis=1), -curvature * x, information
+        return add_normal_prior(likelihood, x, precision)
+
+    at = np.array([[0.3, -1.0, 2.0]])
+    height, slope, information = evaluate(at)
+    assert height == pytest.approx(-0.5 * ((curvature + precision) * at**2).sum())
+    for axis, unit in enumerate(1e-4 * np.eye(3)):
+        difference = evaluate(at + unit)[0] - evaluate(at - unit)[0]
+        assert slope[0, axis] == pytest.approx(difference[0] / 2e-4, rel=1e-6)
+        bend = evaluate(at + unit)[1] - evaluate(at - unit)[1]
+        assert information[0, axis] == pytest.approx(-bend[0] / 2e-4, abs=1e-6)
+
+
+def test_modes_a_standard_deviation_apart_are_different_maxima():
+    """σ is 2 along the first parameter; the best mode of each maximum stands for the others."""
+    position = np.array([[0.0, 0.0], [1.9, 0.0], [2.1, 0.0], [0.1, 0.0], [3.9, 0.0]])
+    covariance = np.tile(np.diag([4.0, 1.0]), (5, 1, 1))
+    evidence, group = np.array([5.0, 1.0, 4.0, 6.0, 3.0]), np.array([0, 0, 0, 1, 0])
+    maximum = merge_modes(position, covariance, evidence, group)
+    # The second is near two better modes and goes to the best; the fourth is of another group.
+    assert maximum.tolist() == [0, 0, 2, 3, 2]
+    gap = position[1:3][None] - position[0]
+    assert compute_squared_distance(gap, covariance[:1])[0] == pytest.approx([0.9025, 1.1025])
 
 
 def quadratic(centre, curvature):

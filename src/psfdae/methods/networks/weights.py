@@ -104,8 +104,8 @@ def channels_last(network: Network) -> Network:
     import torch
 
     # The types of torch have this argument only for tensors.
-    reordered: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return reordered
+    network_in_order: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network_in_order
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:
