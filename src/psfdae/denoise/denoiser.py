@@ -306,9 +306,7 @@ class Denoiser(ABC):
             "chi2": chi2,
             "distance": distance,
             "outlier_score": denoised_stars.outlier_score,
-            "fwhm_px": shapes.fwhm_px,
-            "ellipticity": shapes.ellipticity,
-            "position_angle_deg": shapes.position_angle_deg,
+            **vars(shapes),  # FWHM, ellipticity and position angle
             "shift_x": centred_stars.shift[:, 1],
             "shift_y": centred_stars.shift[:, 0],
             "flags": flags,
