@@ -15,8 +15,7 @@ from docs_pages import ROOT
 from psfdae.base.files import ProductError
 from psfdae_paper import source
 from psfdae_paper.stages import record
-from psfdae_paper.stages.archive import ArchiveError, archive, fetch
-from psfdae_paper.stages.manifest import manifest
+from psfdae_paper.stages.archive import ArchiveError, archive, fetch, manifest
 
 REFERENCE = ROOT / "results/reference"
 SLOW = "paper/tables/psf_metrics.csv"

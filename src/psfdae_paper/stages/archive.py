@@ -1,8 +1,9 @@
-"""Stages `archive` and `fetch`: a finished run as one file, and such a file unpacked and verified.
+"""Stages `manifest`, `archive`, `fetch`: checksums of a finished run, and the run as one file.
 
-The file is a tar archive without compression, because most products are compressed already, and so
-that a damaged byte belongs to one member. Its members are named relative to the run's folder; the
-first one, SHA256SUMS, has the checksums of all others.
+SHA256SUMS shows later damage to the files of a run. The archive is a tar file without compression,
+because most products are compressed already, and so that a damaged byte belongs to one member. Its
+members are named relative to the run's folder; the first one, SHA256SUMS, has the checksums of all
+others.
 """
 
 from __future__ import annotations
@@ -16,16 +17,18 @@ from tempfile import TemporaryDirectory
 from typing import Annotated
 
 from psfdae.base.errors import Error
-from psfdae.base.files import ProductError, atomic_path, compute_sha256
+from psfdae.base.files import ProductError, atomic_path, compute_sha256, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.progress import steps
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import SOURCES
-from psfdae_paper.stages.manifest import CHECKSUMS
 
+CHECKSUMS = "SHA256SUMS"
+"""File with the checksums of a run."""
 CITATION = "CITATION.cff"
 RUN_FILES = ("run.yaml", "runtime.csv", "report.html")
 """Files of a run that its checksums leave out: settings, costs and report."""
+RunFolder = Annotated[Folder, {"argument": True}]
 MAX_CHECKSUMS_B = 2**26
 """Largest size of the list of checksums, in bytes; some 500,000 files."""
 MACHINE_ERRORS = {
@@ -39,8 +42,36 @@ class ArchiveError(Error, RuntimeError):
     """A file that is no archive of a run, is damaged, or would write outside its folder."""
 
 
+@command("paper manifest")
+def manifest(results: RunFolder) -> None:
+    """Write the checksums of a run to SHA256SUMS.
+
+    `sha256sum --check --quiet SHA256SUMS` in the folder then names the files that are damaged.
+    Products are listed; logs, costs and MLflow's copies are not, nor are other runs in folders of
+    this one. SHA256SUMS has the form that `sha256sum` reads.
+
+    Parameters
+    ----------
+    results : Path
+        Folder of a run.
+    """
+    # Other runs, each with its settings, and the run of record may lie in folders of this one.
+    other_runs = {path.parent for path in results.glob("*/**/.settings")} | {results / "reference"}
+    no_products = {"logs", "benchmarks", "benchmarks_on_request", "checkpoints", "mlartifacts"}
+    # Lines as `sha256sum` prints them, in the order of the names.
+    lines = []
+    for path in sorted(results.glob("*/**/*")):
+        # Names relative to the run, so that it may be moved.
+        name = path.relative_to(results)
+        is_hidden = any(part.startswith(".") for part in name.parts)
+        is_product = not is_hidden and name.parts[0] not in no_products
+        if path.is_file() and is_product and other_runs.isdisjoint(path.parents):
+            lines.append(f"{compute_sha256(path)}  {name.as_posix()}\n")
+    write_text(results / CHECKSUMS, "".join(lines))
+
+
 @command("paper archive")
-def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
+def archive(results: RunFolder, out: File) -> None:
     """Write a finished run as one file: products, models, report, checksums and citation.
 
     Products are the files of SHA256SUMS; a file that has changed since is an error.
@@ -52,10 +83,10 @@ def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
     out : Path
         Tar archive.
     """
-    manifest = results / CHECKSUMS
-    if not manifest.is_file():
-        raise ProductError(f"{manifest}: missing; `psfdae paper manifest` writes it")
-    product_sums = read_checksums(manifest.read_text())
+    checksums = results / CHECKSUMS
+    if not checksums.is_file():
+        raise ProductError(f"{checksums}: missing; `psfdae paper manifest` writes it")
+    product_sums = read_checksums(checksums.read_text())
     paths = {name: results / name for name in (*RUN_FILES, *product_sums)}
     paths[CITATION] = SOURCES.parent / CITATION
     for name, path in paths.items():
@@ -66,7 +97,7 @@ def archive(results: Annotated[Folder, {"argument": True}], out: File) -> None:
     for name, path in steps("checksums", paths.items()):
         sums[name] = compute_sha256(path)
         if product_sums.get(name, sums[name]) != sums[name]:
-            raise ProductError(f"{path}: differs from its checksum in {manifest}")
+            raise ProductError(f"{path}: differs from its checksum in {checksums}")
     lines = "".join(f"{digest}  {name}\n" for name, digest in sums.items()).encode()
     with (
         atomic_path(out) as temporary,
