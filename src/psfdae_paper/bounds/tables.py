@@ -153,8 +153,8 @@ class Tables:
             if not evidence.tight:
                 # Far from convergence the fit extrapolates to anything, down to zero.
                 limit = float("nan")
-            key = {"dataset": self.dataset, "reference": reference, "method": method}
-            key |= {"noise_level": level, "n": self.stars.field.size}
+            key: dict[str, object] = {"dataset": self.dataset, "reference": reference}
+            key |= {"method": method, "noise_level": level, "n": self.stars.field.size}
             fit = {"limit": limit, "exponent": exponent, "fit_rms": residual}
             fit |= {"last_change": evidence.last_change}
             for count, error, sigma, values in zip(

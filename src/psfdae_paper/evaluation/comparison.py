@@ -167,7 +167,7 @@ def _compare_means(
         seed_stderr(scatter.get(tuple(table[FIT_KEYS].iloc[0]), np.nan), metric, mean)
         for table, mean in zip(tables, (first_mean, second_mean), strict=True)
     ]
-    both_seeds_stderr = float(np.hypot(*seed_errors))
+    both_seeds_stderr = float(np.hypot(seed_errors[0], seed_errors[1]))
     # Significance: difference over σ = √(σ_stars² + σ_seeds²).
     error = np.hypot(stderr, np.nan_to_num(both_seeds_stderr))
     sigmas = float(0.0 if difference == 0 else difference / error if error > 0 else np.inf)

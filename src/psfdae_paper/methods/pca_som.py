@@ -13,17 +13,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
 from psfdae.base.rng import stream
-from psfdae.base.settings import Count, Group, Positive
+from psfdae.base.settings import Config, Count, Group, Positive
 from psfdae.methods.interface import FitError, Look, Method, Needs, Storage, TrainingSet
-
-if TYPE_CHECKING:
-    from psfdae_paper.configuration.schema import Config
 
 
 class Baseline(Group):

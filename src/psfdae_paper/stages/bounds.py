@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,6 @@ from psfdae.base.options import File
 from psfdae.base.progress import steps
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
-from psfdae.methods import method
 from psfdae.training.star_sets import field_positions, training_set
 from psfdae_paper.bounds import tables
 from psfdae_paper.bounds.estimates import SPLIT, read_test_stars, simulate_fresh_stars
@@ -30,9 +29,8 @@ from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.measure import CELL, MeasuredStars, read_tables
 from psfdae_paper.evaluation.paper import read_paper_names, read_published
-
-if TYPE_CHECKING:
-    from psfdae_paper.methods.wavefront import Wavefront
+from psfdae_paper.methods.wavefront import Wavefront
+from psfdae_paper.methods.wavefront_position import PlacedWavefront
 
 BANK_COLUMNS = ("framed", "field_index", "peak", "seidel")
 """Columns of the product "bank" that the bounds use."""
@@ -187,11 +185,10 @@ def optics(
     position = field_positions(product)[test_stars.star]
     # Without, then with the position of the star in the field.
     summary, stars_table = [], []
-    for name in ("wavefront", "wavefront_position"):
-        method_class = cast("type[Wavefront]", method(name))
-        data = {r: training_set(config, method_class, product, SPLIT, r) for r in test_stars.truth}
+    for method in (Wavefront, PlacedWavefront):
+        data = {r: training_set(config, method, product, SPLIT, r) for r in test_stars.truth}
         # The posterior does not depend on the reference: it is computed once for all references.
-        first = method_class.from_bank(bank_product.arrays, config, next(iter(data.values())))
+        first = method.from_bank(bank_product.arrays, config, next(iter(data.values())))
         estimators = {reference: replace(first, data=data[reference]) for reference in data}
         for level, noisy in steps("noise levels", test_stars.noisy.items()):
             # Time for the log: the posterior takes most of it.
@@ -203,11 +200,11 @@ def optics(
                 truth = test_stars.truth[reference]
                 stars_of_truth = MeasuredStars(test_stars.star, test_stars.field, position, truth)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
-                row |= {"reference": reference, "method": name, "noise_level": level}
+                row |= {"reference": reference, "method": method.name, "noise_level": level}
                 rows, table = stars_of_truth.errors(row, estimate, config.evaluation.data_range)
                 summary += rows
                 stars_table.append(table)
-            print(f"{name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
+            print(f"{method.name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
