@@ -67,8 +67,7 @@ def _draw_stamp(axes: Axes, stamp: np.ndarray, peak: float) -> AxesImage:
     """Draw a stamp in grey; the square root of the flux makes wings visible."""
     # Rows run along +y: the first one is at the bottom.
     grey = np.clip(stamp / peak, 0.0, 1.0) ** 0.5
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     return axes.imshow(
         grey, origin="lower", cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest"
     )
@@ -108,8 +107,7 @@ def draw_predictions(
                 axes.plot(truth[:, index], by_level[level][:, index], ".", ms=2.2, **style)
             # Perfect estimates lie on the diagonal; others may leave the range.
             axes.plot([-1, 1], [-1, 1], color="black", lw=0.7)
-            axes.set_xlim(-1.1, 1.1)
-            axes.set_ylim(-1.6, 1.6)
+            axes.set(xlim=(-1.1, 1.1), ylim=(-1.6, 1.6))
             axes.grid(True)
         # Long labels are broken where a comma or the training data begin.
         label = ESTIMATORS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
@@ -154,9 +152,8 @@ def draw_errors_by_size(
             else:
                 style |= {"marker": "o", "ms": 3.5, "capsize": 2}
                 axes.errorbar(mean_size, mean_error, stderr, **style)
-        axes.set_title(f"λ = {level:g}")
-        axes.set_xlabel("RMS of the state's four numbers / range")
-        axes.set_yscale("log")
+        label = "RMS of the state's four numbers / range"
+        axes.set(title=f"λ = {level:g}", xlabel=label, yscale="log")
         axes.grid(True, which="both")
     # All panels have the same methods: one legend serves them.
     drawing.label_log_axis(panels[0])
@@ -220,23 +217,20 @@ def _draw_twin_distances(figure: FigureBase, curves: pd.DataFrame, state: np.nda
             for x, y in zip(twin.position, twin.sigmas, strict=True):
                 offset = {"xytext": (3, -11), "textcoords": "offset points", "fontsize": 8}
                 axes.annotate(f"{y:.3g} σ", (x, y), color=color, **offset)
-        axes.set_title(f"λ = {level:g}")
-        axes.set_xlabel("multiple of the state; −1 is its twin")
+        axes.set(title=f"λ = {level:g}", xlabel="multiple of the state; −1 is its twin")
         axes.legend(loc="lower left", fontsize=7)
     # Distance of the twin against the defocus, for the choice of the detector's position.
     for marker, level in zip("osv^D", levels, strict=False):
         line = twins[twins.noise_level == level]
         style = {"color": "black", "marker": marker, "ms": 4, "lw": 1.0}
         panels[-1].plot(line.defocus_mm, line.sigmas, label=f"λ = {level:g}", **style)
-    panels[-1].set_title("twin against defocus")
-    panels[-1].set_xlabel("CCD beyond focus (mm)")
+    panels[-1].set(title="twin against defocus", xlabel="CCD beyond focus (mm)")
     panels[-1].legend(loc="lower right", fontsize=7)
     for axes in panels:
         # Three standard deviations can be told from noise.
         axes.axhline(3.0, color="black", ls=":", lw=1.0)
         axes.grid(True)
-    panels[0].set_yscale("log")
-    panels[0].set_ylim(bottom=1.0)
+    panels[0].set(yscale="log", ylim=(1.0, None))
     drawing.label_log_axis(panels[0])
     panels[0].set_ylabel("√χ² from the state's stamps (σ); dotted: 3 σ", fontsize=8)
     named_values = zip(map(parameter_label, DEGREES_OF_FREEDOM), state, strict=True)
@@ -262,8 +256,7 @@ def _draw_twin_stamps(
         for axes, difference in zip(lower, differences, strict=True):
             scale = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
             color = axes.imshow(difference[middle], origin="lower", **scale)
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set(xticks=[], yticks=[])
         upper[0].set_ylabel(f"state\n{label}", rotation=0, ha="right", va="center")
         lower[0].set_ylabel("twin −\nstate", rotation=0, ha="right", va="center")
     _name_fields(stamp_panels[0], fontsize=8)

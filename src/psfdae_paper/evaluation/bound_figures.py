@@ -107,9 +107,8 @@ def draw_efficiency(efficiency: pd.DataFrame, dataset: str) -> Figure:
         if method_rows["efficiency"].isna().all():
             axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
         _set_whole_axis(axes, rows)
-    panels[0][0].set_yscale("log")
     # An efficiency above 1 is noise, or the floor is too rough an approximation.
-    panels[0][0].set_ylim(top=2.0)
+    panels[0][0].set(yscale="log", ylim=(None, 2.0))
     # Line styles of both bounds, as far as they are drawn.
     handles = drawing.make_method_entries(set(efficiency["method"]))
     drawn_rows = efficiency[efficiency.method.isin(names)].dropna(subset=["efficiency"])

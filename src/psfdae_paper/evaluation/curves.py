@@ -69,9 +69,8 @@ def draw_training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> F
     # Errors decrease by decades during the training.
     axes.set_yscale("log")
     drawing.label_log_axis(axes)
-    axes.set_xlabel("optimiser step")
+    axes.set(xlabel="optimiser step", title=title)
     axes.set_ylabel(f"{drawing.METRIC_LABELS['mse']}, mean over the noise levels", fontsize=8)
-    axes.set_title(title)
     axes.grid(True, which="major")
     figure.legend(handles=entries, ncols=2, loc="outside lower center")
     return figure

@@ -168,8 +168,8 @@ def _draw_map(
     style = {"cmap": cmap, "vmin": middle - half_range, "vmax": middle + half_range}
     # A value is a stamp of one pixel, drawn without gaps.
     image = _draw_mosaic(axes, values[:, None, None], fields.grid, fields.field, gap=0, **style)
-    axes.set_ylabel(f"y ({to_field_unit(fields.field)[1]})")
-    axes.set_title(f"{title}: {values.min():.2f} … {values.max():.2f}")
+    title = f"{title}: {values.min():.2f} … {values.max():.2f}"
+    axes.set(ylabel=f"y ({to_field_unit(fields.field)[1]})", title=title)
     axes.figure.colorbar(image, ax=axes, shrink=0.9)
     return image
 
@@ -224,8 +224,7 @@ def _write_values(
 def _label_axes(axes: Axes, field: np.ndarray) -> None:
     """Label both axes with the field angle and its unit."""
     _, unit = to_field_unit(field)
-    axes.set_xlabel(f"field angle x ({unit})")
-    axes.set_ylabel(f"field angle y ({unit})")
+    axes.set(xlabel=f"field angle x ({unit})", ylabel=f"field angle y ({unit})")
 
 
 def to_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:

@@ -158,8 +158,7 @@ def draw_night(night: pd.DataFrame) -> Figure:
             low, high = good_values.min().min(), good_values.max().max()
             axes.set_ylim(low - 0.2 * (high - low), high + 0.4 * (high - low))
     panels[2].plot(x, -night.mag_20th, ".-", ms=4, lw=0.7, color="black")
-    panels[2].set_ylabel("20th brightest star,\n2.5 log₁₀ of counts")
-    panels[2].set_xlabel(label_of_x)
+    panels[2].set(ylabel="20th brightest star,\n2.5 log₁₀ of counts", xlabel=label_of_x)
     for row in night.index[night.verdict == "poor"]:
         for axes in panels:
             axes.axvline(x[row], color=SERIES_COLORS[5], lw=0.8, ls=":")
