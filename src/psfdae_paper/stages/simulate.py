@@ -57,6 +57,9 @@ from psfdae_paper.stars.nights import (
 )
 from psfdae_paper.stars.scenes import template_wavefronts
 
+ENOUGH_LIGHT = 0.8
+"""Fraction of the light that a stamp has to hold, unless there is a warning."""
+
 
 class StampSizeError(Error, ValueError):
     """The PSFs of a telescope do not fit into their stamps."""
@@ -181,9 +184,7 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     return FieldOfPsfs(psf, product["grid"], product["field"], pd.DataFrame(columns))
 
 
-def check_stamps(
-    config: Config, fields: FieldOfPsfs, least_energy: float, enough_light: float = 0.8
-) -> list[str]:
+def check_stamps(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
     """Return warnings: stamps with too little light, and undersampled PSFs.
 
     Parameters
@@ -193,9 +194,7 @@ def check_stamps(
     fields : FieldOfPsfs
         Static PSFs on stamps, with the light inside each stamp and the FWHM.
     least_energy : float
-        Fraction of the light below which a stamp is an error.
-    enough_light : float
-        Fraction of the light below which there is a warning.
+        Fraction of the light below which a stamp is an error; below `ENOUGH_LIGHT` it is a warning.
 
     Raises
     ------
@@ -205,21 +204,18 @@ def check_stamps(
     warnings = []
     # Light of each PSF inside its stamp.
     energy, side = fields.table.energy.to_numpy(), config.framing.stamp_px
-    if energy.min() < enough_light:
+    if energy.min() < ENOUGH_LIGHT:
         # The field with the least light decides which stamp is large enough.
         worst_field = int(energy.argmin())
         x, y = np.rad2deg(fields.field[worst_field])
         # Stamps up to four times as wide are tried.
-        sufficient_px = _find_stamp_px(config, worst_field, 4 * side, enough_light)
-        advice = (
-            f"framing.stamp_px={sufficient_px} contains {enough_light:.0%} everywhere"
-            if sufficient_px
-            else f"no stamp up to {4 * side} px contains {enough_light:.0%} everywhere"
-        )
+        max_px, share = 4 * side, f"{ENOUGH_LIGHT:.0%}"
+        stamp_px = _find_stamp_px(config, worst_field, max_px)
+        size = f"framing.stamp_px={stamp_px}" if stamp_px else f"no stamp up to {max_px} px"
         message = (
-            f"{int((energy < enough_light).sum())} of {energy.size} fields have less than "
-            f"{enough_light:.0%} of their light inside {side} × {side} px, the least "
-            f"{energy[worst_field]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
+            f"{int((energy < ENOUGH_LIGHT).sum())} of {energy.size} fields have less than "
+            f"{share} of their light inside {side} × {side} px, the least "
+            f"{energy[worst_field]:.1%} at ({x:.3g}, {y:.3g})°; {size} contains {share} everywhere"
         )
         if energy.min() < least_energy:
             raise StampSizeError(f"telescope = {config.telescope.name}: {message} (--least-energy)")
@@ -234,9 +230,7 @@ def check_stamps(
     return warnings
 
 
-def _find_stamp_px(
-    config: Config, worst_field: int, max_px: int, enough_light: float
-) -> int | None:
+def _find_stamp_px(config: Config, worst_field: int, max_px: int) -> int | None:
     """Return the side of the smallest even stamp with enough light of a field.
 
     None if it would be larger than `max_px`, or if the PSF cannot be computed on such a stamp.
@@ -249,23 +243,19 @@ def _find_stamp_px(
         Number of the field with the least light inside its stamp.
     max_px : int
         Side of the largest stamp that is tried.
-    enough_light : float
-        Fraction of the light that a stamp has to hold.
     """
     # One propagation on the largest stamp; pixels of smaller ones are the same.
     framing = config.framing.model_copy(update={"stamp_px": max_px})
-    source = template_wavefronts(config)
+    source, optics = template_wavefronts(config), config.optics
     try:
-        propagation = Propagation(
-            source, config.telescope, config.optics, framing, framing.search_px
-        )
+        propagation = Propagation(source, config.telescope, optics, framing, framing.search_px)
         stamp = propagation.frame(max_px, stars=np.array([worst_field]))[0][0]
     except (SamplingError, FramingError):
         return None
     # Smaller stamps are the middle of the largest one.
     for size in range(config.framing.stamp_px + 2, max_px + 1, 2):
         centre = slice((max_px - size) // 2, (max_px + size) // 2)
-        if stamp[centre, centre].sum() >= enough_light:
+        if stamp[centre, centre].sum() >= ENOUGH_LIGHT:
             return size
     return None
 
