@@ -89,16 +89,14 @@ class PcaFit:
         """
         # |y − m|² = |m|² − 2 y·m + |y|², without |y|², which is the same for all nodes.
         score = (self.nodes**2).sum(axis=1) - 2.0 * self.features(images) @ self.nodes.T
-        winner: np.ndarray = score.argmin(axis=1)
-        return winner
+        return np.asarray(score.argmin(axis=1))
 
     def predict(self, images: np.ndarray) -> np.ndarray:
         """Return the PSF of every image's node, shape (n, d, d).
 
         Raises ValueError as `features` does.
         """
-        psf: np.ndarray = self.psf[self.assign(images)].reshape(images.shape)
-        return psf
+        return np.asarray(self.psf[self.assign(images)].reshape(images.shape))
 
 
 @dataclass(frozen=True)

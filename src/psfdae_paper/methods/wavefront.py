@@ -194,8 +194,7 @@ class Wavefront(Method):
     @cached_property
     def _mean_stamp(self) -> np.ndarray:
         """Mean of the bank's stamps, (1, d, d): the same for all noise levels."""
-        mean: np.ndarray = self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
-        return mean
+        return np.asarray(self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True))
 
     def posterior(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -241,5 +240,4 @@ class Wavefront(Method):
         if not self.needs.position or position is None:
             return None
         # Fields are numbered ix + P iy on a grid of P points a side.
-        fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
-        return fields
+        return np.asarray(np.rint(position @ [1, self.bank.points]), int)

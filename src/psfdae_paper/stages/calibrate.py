@@ -137,8 +137,7 @@ class _CachedWavefronts:
         if pupil.axis.size not in self._opd:
             all_wavefronts = np.arange(len(self))
             self._opd[pupil.axis.size] = self.source.opd(all_wavefronts, pupil, dtype)
-        opd: np.ndarray = self._opd[pupil.axis.size][index]
-        return opd
+        return np.asarray(self._opd[pupil.axis.size][index])
 
 
 def _source(config: Config, r0: float) -> WavefrontSource:

@@ -105,8 +105,7 @@ def crop_jittered(frames: np.ndarray, jitter: np.ndarray, margin: int) -> np.nda
     pixels = np.arange(frames.shape[-1] - 2 * margin)
     index = np.broadcast_to(margin - np.asarray(jitter), (len(frames), 2))[:, :, None] + pixels
     stars = np.arange(len(frames))[:, None, None]
-    stamps: np.ndarray = frames[stars, index[:, 0, :, None], index[:, 1, None, :]]
-    return stamps
+    return np.asarray(frames[stars, index[:, 0, :, None], index[:, 1, None, :]])
 
 
 def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

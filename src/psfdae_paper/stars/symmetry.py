@@ -62,8 +62,7 @@ class Symmetry:
             iy, ix = ix, iy
         iy = points - 1 - iy if self.flip_rows else iy
         ix = points - 1 - ix if self.flip_columns else ix
-        field: np.ndarray = ix + points * iy
-        return field
+        return np.asarray(ix + points * iy)
 
     def window(self, jitter: tuple[int, int], margin: int) -> tuple[int, int]:
         """Return the first row and column to cut from an image with a margin around the stamp.
@@ -93,5 +92,4 @@ SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3
 
 def orbit(field: np.ndarray, points: int) -> np.ndarray:
     """Return the lowest of the fields to which symmetries take each: a name of their orbit."""
-    lowest: np.ndarray = np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
-    return lowest
+    return np.asarray(np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0))

@@ -25,8 +25,7 @@ WILDCARDS = ("{dataset}", "{split}", "{reference}")
 
 def method_names(run: Run, dataset: str) -> list[str]:
     """Return the names of a dataset's methods, in the order of tables."""
-    names: list[str] = load_dataset_config(run, dataset).methods
-    return names
+    return list(load_dataset_config(run, dataset).methods)
 
 
 def list_stored_methods(run: Run, dataset: str) -> list[type[Method]]:
