@@ -108,7 +108,7 @@ def test_differences_from_the_paper_are_named(words, data, training):
 
 
 @pytest.mark.parametrize("name", list_experiments())
-def test_differences_of_a_variant_are_those_of_its_setting(name):
+def test_a_variant_differs_from_the_paper_by_its_setting(name):
     """A variant is compared with the paper's settings of its dataset."""
     experiment = load_experiment(name)
     run = read_run({"name": name})
@@ -119,7 +119,7 @@ def test_differences_of_a_variant_are_those_of_its_setting(name):
         keys = [*(experiment.settings[variant.setting] or {}), "seed"]
         assert {*keys} <= {text.partition(" = ")[0] for text in texts}
         assert line.startswith("Not the paper's data: ")
-        # Differences of the preset alone are those of the dataset.
+        # The differences by the preset, which the dataset has as well, are among them.
         base = report.find_differences(run, variant.dataset)
         assert {*base["data"]} <= {*texts}
 

@@ -227,7 +227,7 @@ def test_tables_within_their_scatter_are_not_named(tmp_path):
     assert "3 rows are in one alone" in output and "Not in A: tables/stability.csv" in output
 
 
-def test_tables_are_compared_that_lack_a_column_of_a_standard_error(tmp_path):
+def test_tables_that_lack_a_standard_error_are_compared(tmp_path):
     """Each column that an expression names; values without it scatter as of a fit."""
     lacking = []
     for name in record_tables.list_tables(RECORD):
