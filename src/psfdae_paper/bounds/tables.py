@@ -216,9 +216,8 @@ def add_means(
     stars = tables.stars
     for level in config.noise.levels:
         start = time.monotonic()
-        likelihood = Likelihood.from_noise(
-            noise_model(config), level, bank.stamps((bank.margin,) * 2)
-        )
+        stamps = bank.stamps((bank.margin,) * 2)
+        likelihood = Likelihood.from_noise(noise_model(config), level, stamps)
         # Both posterior means over the bank.
         over_bank, is_sparse = {}, np.zeros(stars.star.size, bool)
         for method, field_is_known in POSTERIOR_MEANS.items():
@@ -259,9 +258,8 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     stars = tables.stars
     for level in config.noise.levels:
         # Counts are relative to the mean static PSF without centring error.
-        likelihood = Likelihood.from_noise(
-            noise_model(config), level, static[:, static.shape[1] // 2]
-        )
+        stamps = static[:, static.shape[1] // 2]
+        likelihood = Likelihood.from_noise(noise_model(config), level, stamps)
         for method, field_is_known in POSTERIOR_MEANS.items():
             field = stars.field if field_is_known else None
             posterior = compute_exact_posterior(stars.noisy[level], static, likelihood, field)

@@ -548,12 +548,8 @@ def fit_alignment_method(
     # The emulator interpolates between the stamps of the large set. The network's estimate starts
     # the first fit.
     start_s = time.perf_counter()
-    emulator = StampEmulator(
-        StateOptics(wavefronts, operator()),
-        large_product["states"],
-        large_product["stamps"],
-        config.fit,
-    )
+    large_set = large_product["states"], large_product["stamps"]
+    emulator = StampEmulator(StateOptics(wavefronts, operator()), *large_set, config.fit)
     # The network's estimate is near enough to the maximum for Levenberg steps.
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
@@ -567,15 +563,13 @@ def fit_alignment_method(
         # In focus, a state and its twin have nearly the same stamps: take the better fit.
         best_fit, twin_tried = refit_twins(fast, first_fit, wavefronts, config.fit)
         # The last steps use the exact optics.
-        final_fit = best_fit
-        if fast is not exact:
-            final_fit = exact.maximise(best_fit.parameters, config.fit)
+        final_fit = best_fit if fast is exact else exact.maximise(best_fit.parameters, config.fit)
         # Zero if all steps were exact.
         last_evaluations = final_fit.evaluations * (fast is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - start_s, len(stamps)))
         # The next method, which has more parameters, starts from this estimate.
         start = final_fit.parameters[:, :4]
-        fits["estimates"].append(final_fit.parameters[:, :4])
+        fits["estimates"].append(start)
         # Deviance −2 ln L, with ln L = 0 for a perfect fit.
         fits["deviance"].append(-2.0 * final_fit.height)
         fits["evaluations"].append(np.array([best_fit.evaluations, last_evaluations]))
