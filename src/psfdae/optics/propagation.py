@@ -355,10 +355,15 @@ class FieldPropagator:
         sampling = self._sampling
         if sampling.propagator is not None:
             return sampling.propagator(opd, offset_px)
-        # The field by two transforms, and the light on the pixels from its intensity.
-        (rows,) = sampling.along_x(self.pupil_fields(opd, offset_px))
-        (field,) = sampling.along_y(rows)
-        return sampling.to_pixels(field.real**2 + field.imag**2)
+        # The field by two transforms, and the light on the pixels from its intensity. Stars with
+        # 2^16 samples are processed together: their fields fit into a core's cache.
+        stamps, size = [], max(1, 2**16 // opd.shape[-1] ** 2)
+        for part in (slice(start, start + size) for start in range(0, max(len(opd), 1), size)):
+            offset = None if offset_px is None else offset_px[part]
+            (rows,) = sampling.along_x(self.pupil_fields(opd[part], offset))
+            (field,) = sampling.along_y(rows)
+            stamps.append(sampling.to_pixels(field.real**2 + field.imag**2))
+        return np.concatenate(stamps)
 
     def pupil_fields(self, opd: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
         """Return A exp(2πiW) of a batch, with the tilt that shows the image at an offset."""
