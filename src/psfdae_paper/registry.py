@@ -7,14 +7,24 @@ and requirements. A method of a dataset is a registered model; its versions are 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from psfdae.methods import method
+from psfdae.methods.interface import Method
 from psfdae_paper.served import write_pyfunc
 from psfdae_paper.tracking import KEY, TrackedRun
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+
+WITHOUT_VALIDATION = (
+    "This method is fitted to the validation stars as well, so that it has no validation error, "
+    'and no version has the alias "best": test errors choose nothing.'
+)
+"""Description of a registered model of such a method."""
 
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRun) -> str | None:
@@ -49,11 +59,30 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, run: TrackedRu
     client.finalize_logged_model(model_id, "READY")
     # A version points to the files of the model; they are not copied.
     if run.data is not None:
-        if not client.search_registered_models(f"name = '{name}'"):
-            client.create_registered_model(name)
+        register(client, name, method(run.key[0]))
         tags = dict(zip(KEY[2:], run.key[2:], strict=True))
         client.create_model_version(name, model.artifact_location, run_id, tags, model_id=model_id)
     return model_id
+
+
+def register(client: MlflowClient, name: str, kind: type[Method]) -> None:
+    """Create a registered model of a method, unless there is one of this name."""
+    # Only methods that leave out the validation stars have a validation error.
+    description = None if kind.needs.validation else WITHOUT_VALIDATION
+    with accept_existing():
+        client.create_registered_model(name, description=description)
+
+
+@contextmanager
+def accept_existing() -> Iterator[None]:
+    """Accept that a name is in use: another importer may create it at any time."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        yield
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
 
 
 def choose_best(client: MlflowClient, experiment: str, run: TrackedRun) -> None:
@@ -62,7 +91,7 @@ def choose_best(client: MlflowClient, experiment: str, run: TrackedRun) -> None:
     Test errors choose nothing. All versions compete that have the split, the reference, the
     validation stars and their noise in common with this run, whatever their other settings. The
     alias is "best" for random splits and realisations, otherwise "best-SPLIT-REFERENCE". Methods
-    that are fitted to the validation stars as well do not have it.
+    that are fitted to the validation stars as well do not have it (`WITHOUT_VALIDATION`).
 
     Parameters
     ----------

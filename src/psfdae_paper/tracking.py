@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 from psfdae.base.belonging import STARS, require_origin
 from psfdae.base.files import ProductError, compute_sha256, read_product
 from psfdae.base.reading import from_tree, read_json, read_table, read_yaml
-from psfdae.base.settings import leaves
+from psfdae.base.settings import leaves, parse_settings
 from psfdae.denoise.bundle import SUFFIX, Bundle, read_bundle
 from psfdae.methods import fit_files as fits
 from psfdae.methods import method
@@ -27,6 +27,7 @@ from psfdae.training.packing import build_uncalibrated
 from psfdae.training.star_sets import read_stars
 from psfdae_paper.configuration import estimators
 from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.experiment import Experiment
 from psfdae_paper.evaluation.night import read_night
 from psfdae_paper.sweeps.points import compute_hash
 
@@ -363,6 +364,47 @@ def read_sweep_runs(results: Path, name: str) -> list[TrackedRun]:
     place = (results, f"sweep_{name}", source, ("sweep", *points[0].key[1:]))
     tags = {"best_point": str(best_point.get("point", ""))}
     return [TrackedRun(*place, *content, name=f"sweep {name}", tags=tags), *points]
+
+
+def join_experiment(results: Path, name: str, runs: Sequence[TrackedRun]) -> list[TrackedRun]:
+    """Return an experiment and the runs of its variants, the parent first.
+
+    The runs have the names of datasets and settings in place of the names of variants, and no
+    models: registered models are of datasets without overrides.
+
+    Parameters
+    ----------
+    results : Path
+        Folder that the workflow writes to.
+    name : str
+        Name of the experiment.
+    runs : sequence of TrackedRun
+        Runs of the variants, as `read_dataset_runs` returns them.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If the table or the settings of the experiment are missing or damaged.
+    """
+    source, folder = f"experiments/{name}", results / "experiments" / name
+    tree = read_yaml(folder / "experiment.yaml")
+    definition = parse_settings(Experiment, {k: v for k, v in tree.items() if k != "given"})
+    # All methods of all variants, with the table and the figure that compare them.
+    key = ("experiment", " ".join(definition.datasets), "all", "all")
+    tables = [folder / file for file in ("errors.csv", "errors.md", "experiment.yaml")]
+    content = (f"experiment_{name}", source, key, tree, tables, [folder / "errors.png"])
+    parent = TrackedRun(results, *content, name=f"experiment {name}")
+    variants, children = {variant.name: variant for variant in definition.variants}, []
+    for run in runs:
+        variant = variants[run.key[1]]
+        labels = {
+            "key": (run.key[0], variant.dataset, *run.key[2:]),
+            "name": f"{run.key[0]} {variant.dataset} {variant.setting} seed={variant.seed}",
+            "tags": {"setting": variant.setting, "overrides": " ".join(variant.overrides)},
+        }
+        fields: dict[str, Any] = {"experiment": parent.experiment, "parent": source, **labels}
+        children.append(replace(run, **fields, bundle=None))
+    return [parent, *children]
 
 
 def _read_point_run(results: Path, name: str, point: str) -> TrackedRun:

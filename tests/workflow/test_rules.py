@@ -213,6 +213,12 @@ def test_a_trial_waits_for_all_that_can_be_finished_before_it():
         assert known == [sweeps.result_file(RUN, "dae_adaptive", n) for n in before]
 
 
+def test_figures_of_pairs_of_axes_need_two_axes():
+    for name, count in (("noise_mix", 2), ("som", 4)):
+        files = sweeps.sweep_figures(RUN, name)
+        assert len(files) == count and all(f"sweeps/{name}/figures/" in file for file in files)
+
+
 def test_an_unknown_point_or_no_sweep_ends_in_one_line():
     with pytest.raises(SystemExit, match="sweep gmm has no point abc"):
         sweeps.sweep_point(RUN, wildcards(sweep="gmm", point="abc"))

@@ -2,8 +2,12 @@ rule experiment_table:
     input:
         lambda w: experiments.experiment_evaluations(RUN),
     output:
-        table=f"{RESULTS}/experiments/{{experiment}}/errors.csv",
-        markdown=f"{RESULTS}/experiments/{{experiment}}/errors.md",
+        multiext(
+            f"{RESULTS}/experiments/{{experiment}}/",
+            table="errors.csv",
+            markdown="errors.md",
+            definition="experiment.yaml",
+        ),
     log:
         f"{RESULTS}/logs/experiments/{{experiment}}/table.log",
     benchmark:
@@ -12,13 +16,15 @@ rule experiment_table:
         experiment=RUN.experiment or "none",
     localrule: True
     params:
-        variants=lambda w: experiments.variant_options(RUN),
+        variants=lambda w: [variant.name for variant in RUN.variants],
+        given=lambda w: [f"--override={word}" for word in RUN.overrides],
         source=hash_code("experiment"),
+        folder=subpath(output.table, parent=True),
     message:
         "Comparing the settings of experiment {wildcards.experiment}"
     shell:
-        "psfdae paper experiment {params.variants} --markdown {output.markdown}"
-        " --out {output.table} {input} > {log} 2>&1"
+        "psfdae paper experiment {wildcards.experiment} {input} {params.given:q}"
+        " --out {params.folder} > {log} 2>&1"
 
 
 rule figure_experiment:
@@ -44,6 +50,27 @@ rule figure_experiment:
     shell:
         "psfdae paper figure experiment --name {wildcards.experiment} --out {output} {input}"
         " > {log} 2>&1"
+
+
+use rule track as track_experiment with:
+    input:
+        rules.experiment_table.output,
+        rules.figure_experiment.output,
+    output:
+        f"{RESULTS}/mlflow/experiment_{{experiment}}.csv",
+    log:
+        f"{RESULTS}/logs/track/experiment_{{experiment}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/experiments/{{experiment}}/track.tsv"
+    localrule: True
+    params:
+        what=lambda w: [f"--experiment {w.experiment}", *experiments.variant_stars(RUN)],
+        results=lambda w: RESULTS,
+        preset=PRESET,
+        database=f"{RESULTS}/mlflow.db",
+        source=hash_code("track"),
+    message:
+        "Importing experiment {wildcards.experiment} into MLflow"
 
 
 rule experiment:

@@ -69,6 +69,7 @@ rule sweep_summary:
             cost="cost.csv",
             best="best.yaml",
             definition="sweep.yaml",
+            study="study.journal",
         ),
     log:
         f"{RESULTS}/logs/sweeps/{{sweep}}/summary.log",
@@ -92,8 +93,7 @@ rule sweep_summary:
 
 rule figure_sweep:
     input:
-        summary=rules.sweep_summary.output.summary,
-        definition=rules.sweep_summary.output.definition,
+        rules.sweep_summary.output.study,
     output:
         report(
             f"{RESULTS}/sweeps/{{sweep}}/figures/{{sweep_figure}}.png",
@@ -106,7 +106,7 @@ rule figure_sweep:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{sweep_figure}}.tsv"
     wildcard_constraints:
-        sweep_figure=match_any(sweeps.FIGURES),
+        sweep_figure=match_any(sweeps.ALL_AXES + sweeps.TWO_AXES),
     threads: 1
     resources:
         mem_mb=500,
@@ -115,38 +115,29 @@ rule figure_sweep:
     message:
         "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
     shell:
-        "psfdae paper sweep figure {wildcards.sweep_figure} --definition {input.definition}"
-        " --table {input.summary} --out {output} > {log} 2>&1"
+        "psfdae paper sweep figure {wildcards.sweep_figure} --study {input} --out {output}"
+        " > {log} 2>&1"
 
 
-rule track_sweep:
+use rule track as track_sweep with:
     input:
         rules.sweep_summary.output,
-        expand(
-            rules.figure_sweep.output, sweep_figure=sweeps.FIGURES, allow_missing=True
-        ),
+        lambda w: sweeps.sweep_figures(RUN, w.sweep),
     output:
         f"{RESULTS}/mlflow/sweep_{{sweep}}.csv",
     log:
         f"{RESULTS}/logs/track/sweep_{{sweep}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/track.tsv"
-    # SQLite takes one machine; jobs that meet on it wait for each other.
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
     params:
+        what="--sweep {sweep}",
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
         source=hash_code("track"),
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
-    shell:
-        "psfdae paper track --results {params.results} --preset {params.preset}"
-        " --database {params.database} --sweep {wildcards.sweep} --out {output}"
-        " > {log} 2>&1"
 
 
 rule sweep:

@@ -7,7 +7,6 @@ standard errors, and their ratios to the first setting.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,22 +14,12 @@ import pandas as pd
 from psfdae.base.figures import SERIES_COLORS, apply_style, new_figure
 from psfdae.base.types import Axes, Figure
 from psfdae.methods import method
-from psfdae_paper.evaluation.drawing import METRIC_LABELS
+from psfdae_paper.configuration.experiment import Variant
+from psfdae_paper.evaluation.drawing import METRIC_LABELS, set_noise_axis
 
 ROW = ["dataset", "split", "reference", "method", "noise_level", "metric"]
 """Columns that identify a number which settings are compared by."""
-NUMBERS = [
-    *("seeds", "value", "stderr", "stderr_stars", "ratio", "ratio_stderr", "stars"),
-]
-
-
-class Variant(NamedTuple):
-    """Name, dataset, setting and seed of an evaluated dataset."""
-
-    name: str
-    dataset: str
-    setting: str
-    seed: int
+NUMBERS = ["seeds", "value", "stderr", "stderr_stars", "ratio", "ratio_stderr", "stars"]
 
 
 def compare_settings(evaluations: pd.DataFrame, variants: Sequence[Variant]) -> pd.DataFrame:
@@ -53,7 +42,8 @@ def compare_settings(evaluations: pd.DataFrame, variants: Sequence[Variant]) -> 
         from the scatter between seeds are NaN for one seed.
     """
     # The name of a variant stands for its dataset, setting and seed.
-    names = pd.DataFrame(variants, columns=Variant._fields).set_index("name")
+    names = pd.DataFrame([(v.name, v.dataset, v.setting, v.seed) for v in variants])
+    names = names.set_axis(["variant", "dataset", "setting", "seed"], axis=1).set_index("variant")
     table = evaluations.rename(columns={"dataset": "variant"}).join(names, on="variant")
     # The same number of the first setting with the same seed: stars and noise are mostly the same.
     settings = list(dict.fromkeys(names.setting))
@@ -152,8 +142,6 @@ def draw_experiment(table: pd.DataFrame, name: str) -> Figure:
         panel_row[0].set_ylabel("\n".join(map(str, part)), fontsize=8)
     for panel, kind in zip(panels[0], methods, strict=True):
         panel.set_title(method(kind).look.label.replace(" (", "\n("), fontsize=8)
-    for panel in panels[-1]:
-        panel.set_xlabel("noise level λ")
     figure.supylabel(label, fontsize=9)
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
@@ -167,12 +155,12 @@ def _draw_panel(
     panel: Axes, rows: pd.DataFrame, settings: Sequence[str], column: str, error_column: str
 ) -> None:
     """Draw a line with error bars for each setting against the noise level."""
-    from matplotlib.ticker import NullLocator
-
+    levels = np.unique(rows.noise_level)
     for i, setting in enumerate(settings):
         line = rows[rows.setting == setting]
+        # Bars of different settings stand side by side, 1.5 % apart.
         panel.errorbar(
-            line.noise_level,
+            line.noise_level * 1.015 ** (i - 0.5 * (len(settings) - 1)),
             line[column],
             yerr=line[error_column].fillna(0.0),
             color=SERIES_COLORS[i % len(SERIES_COLORS)],
@@ -183,8 +171,5 @@ def _draw_panel(
             capsize=2,
             label=setting,
         )
-    levels = sorted(set(rows.noise_level))
-    panel.set_xscale("log")
-    panel.set_xticks(levels, [f"{level:g}" for level in levels], rotation=45, fontsize=7)
-    panel.xaxis.set_minor_locator(NullLocator())
+    set_noise_axis(panel, levels)
     panel.grid(visible=True, which="major")

@@ -1,6 +1,7 @@
 """Stages `experiment` and `figure experiment`: settings of datasets compared over several seeds.
 
-Inputs: evaluations of all variants of an experiment. Outputs: a table (CSV, Markdown) and a figure.
+Inputs: evaluations of all variants of an experiment. Outputs: a table (CSV, Markdown), the
+settings and a figure.
 """
 
 from __future__ import annotations
@@ -9,16 +10,17 @@ from pathlib import Path
 from typing import Annotated
 
 import pandas as pd
+import yaml
 
 from psfdae.base.figures import write_png
 from psfdae.base.files import write_csv, write_text
-from psfdae.base.options import File
+from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.experiment import load_experiment
 from psfdae_paper.evaluation.experiments import (
     NUMBERS,
     ROW,
-    Variant,
     compare_settings,
     draw_experiment,
     format_settings,
@@ -28,10 +30,10 @@ from psfdae_paper.evaluation.measure import MeasuredStars, read_tables
 
 @command("paper experiment")
 def experiment(
+    name: Annotated[str, {"argument": True}],
     evaluations: Annotated[tuple[File, ...], {"argument": True}],
-    variant: tuple[tuple[str, str, str, int], ...],
-    markdown: File,
-    out: File,
+    overrides: Annotated[tuple[str, ...], {"flag": "--override"}],
+    out: Folder,
 ) -> None:
     """Compare the settings of an experiment: means over seeds, and ratios to the first setting.
 
@@ -39,19 +41,24 @@ def experiment(
 
     Parameters
     ----------
+    name : str
+        Name of a file of config/experiment.
     evaluations : sequence of Path
-        CSV files of the stage evaluate, of all variants.
-    variant : sequence of tuples
-        Name in the evaluations, dataset, setting and seed; repeat for more.
-    markdown : Path
-        Markdown file with the MSE of all settings side by side.
+        CSV files of the stage evaluate, of all its variants.
+    overrides : sequence of str
+        Overrides of the workflow that all variants share, its preset first.
     out : Path
-        CSV.
+        Folder for errors.csv, errors.md with the MSE of all settings side by side, and
+        experiment.yaml with the settings.
     """
-    variants = [Variant(*words) for words in variant]
-    table = compare_settings(read_tables(evaluations, MeasuredStars.columns), variants)
-    write_csv(out, table)
-    write_text(markdown, format_settings(table, out.parent.name))
+    definition = load_experiment(name)
+    rows = read_tables(evaluations, MeasuredStars.columns)
+    table = compare_settings(rows, definition.variants)
+    write_csv(out / "errors.csv", table)
+    write_text(out / "errors.md", format_settings(table, name))
+    # Unsorted: the first setting is the one that the others are divided by.
+    tree = {"given": list(overrides), **definition.model_dump(exclude={"preset"})}
+    write_text(out / "experiment.yaml", yaml.safe_dump(tree, sort_keys=False))
 
 
 @command("paper figure experiment")

@@ -9,25 +9,22 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import click
 
 from psfdae.base.files import write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_json
-from psfdae.base.settings import parse_settings
 from psfdae.methods.interface import FitError
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.estimators import list_swept_networks
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.configuration.sweep import Axis, Value
 from psfdae_paper.sweeps.measurement import Measurement, Task
-from psfdae_paper.sweeps.points import SweepError, changes, plan_sweep, set_values
+from psfdae_paper.sweeps.points import Point, SweepError, plan_sweep
 
 
 def training_module(model: str) -> str:
@@ -43,25 +40,6 @@ def training_module(model: str) -> str:
     if model in list_swept_networks():
         return "psfdae_paper.stages.network_point"
     return "psfdae_paper.stages.method_point"
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial of an adaptive sweep.
-
-    Attributes
-    ----------
-    slot : int
-        Number of the trial.
-    search : dict
-        space, seed, startup, metric and direction of the sweep.
-    earlier_points : sequence of str
-        Names of the points on whose results it depends.
-    """
-
-    slot: int
-    search: Mapping[str, Any]
-    earlier_points: Sequence[str]
 
 
 Overrides = Annotated[tuple[str, ...], {"argument": True}]
@@ -123,22 +101,16 @@ def sweep_point(
     dataset = sweep.dataset or sweep.model
     task = Task(*(dataset, sweep.split, sweep.reference), dict(data), plan.levels, out, checkpoint)
     # An adaptive sweep proposes values for a trial when it runs.
-    trial = None
     if entry.slot is not None:
-        trial = Trial(
-            entry.slot, plan.search, [earlier.name for earlier in plan.earlier_trials(entry)]
-        )
-    point(part(sweep.reads, entry.config), sweep.model, entry.values, entry.keys, task, trial)
+        results = [
+            read_json(out.parent / earlier.name / "result.json")
+            for earlier in plan.earlier_trials(entry)
+        ]
+        entry = plan.propose_values(entry, results)
+    point(part(sweep.reads, entry.config), sweep.model, entry, task)
 
 
-def point(
-    config: Config,
-    model: str,
-    values: Mapping[str, Value],
-    keys: Mapping[str, Value],
-    task: Task,
-    trial: Trial | None = None,
-) -> None:
+def point(config: Config, model: str, entry: Point, task: Task) -> None:
     """Train and measure one point; leave `result.json`, `cost.json` and the model's files.
 
     A training that cannot continue (not finite, or dead in all its starts) is a result, too, with
@@ -150,35 +122,17 @@ def point(
         Groups that a point of the model reads.
     model : str
         Name of a method, or of a network of scene 3.
-    values : mapping
-        Value of every axis; values of a trial are proposed here.
-    keys : mapping
-        Configuration keys that differ from the dataset's.
+    entry : Point
+        Values of the axes, configuration keys that differ from the dataset's, and number of a
+        trial.
     task : Task
         Data, noise levels, and the folder for the results.
-    trial : Trial, optional
-        Trial of an adaptive sweep.
 
     Raises
     ------
     ProductError
         If an input is missing or damaged.
-    ConfigError
-        If a trial proposes values that the configuration does not allow.
     """
-    # A trial gets its values from the results of earlier trials; the configuration with these
-    # values is checked again.
-    if trial is not None:
-        space = {name: parse_settings(Axis, axis) for name, axis in trial.search["space"].items()}
-        earlier_results = [
-            read_json(task.folder.parent / name / "result.json") for name in trial.earlier_points
-        ]
-        # Optuna is needed for this alone; `sweep_source` of the workflow names the module, too.
-        adaptive = import_module("psfdae_paper.sweeps.adaptive")
-        values = adaptive.ask(space, trial.search, trial.slot, earlier_results)
-        trial_keys = changes(space, values)
-        tree = set_values(config.model_dump(), trial_keys)
-        config, keys = parse_settings(type(config), tree), {**keys, **trial_keys}
     # Files of an earlier training are removed.
     training = import_module(training_module(model))
     for name in (*training.list_files(model), *task.tables.values(), "cost.json", "result.json"):
@@ -187,13 +141,13 @@ def point(
     # Metrics and settings only: the cost of a point is in a file of its own.
     result = {
         "point": task.folder.name,
-        "slot": trial.slot if trial else None,
+        "slot": entry.slot,
         "model": model,
         "dataset": task.dataset,
         "split": task.split,
         "reference": task.reference,
-        "values": dict(values),
-        "keys": dict(keys),
+        "values": entry.values,
+        "keys": entry.keys,
         **outcome,
     }
     write_text(task.folder / "result.json", json.dumps(result, indent=1) + "\n")

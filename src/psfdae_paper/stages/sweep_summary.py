@@ -1,28 +1,31 @@
 """Stages `sweep summary`, `sweep figure` and `best`: tables and figures of a sweep's points.
 
-Input: the results of all points. Outputs: their table, the best point as overrides, the cost of
-each training, and two figures. The best point is chosen without errors on the test part.
+Input: the results of all points. Outputs: their table and study, the best point as overrides, the
+cost of each training, and figures. The best point is chosen without errors on the test part.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pandas as pd
 import yaml
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import ProductError, as_yaml, write_csv, write_text
+from psfdae.base.files import ProductError, as_yaml, write_bytes, write_csv, write_text
 from psfdae.base.options import File, Folder
-from psfdae.base.reading import read_json, read_table, read_yaml
+from psfdae.base.reading import read_json, read_yaml
 from psfdae.base.settings import as_overrides
 from psfdae_paper.configuration.command import command
-from psfdae_paper.evaluation import sweep_figures
+from psfdae_paper.configuration.sweep import Sweep
+from psfdae_paper.sweeps.figures import draw_sweep
 from psfdae_paper.sweeps.measurement import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
+from psfdae_paper.sweeps.study import create_study, open_journal
 
 
 @command("paper sweep summary")
@@ -45,14 +48,14 @@ def sweep_summary(
     points : Path
         Folder with a folder for each point.
     out : Path
-        Folder for summary.csv, cost.csv, best.yaml and sweep.yaml.
+        Folder for summary.csv, cost.csv, best.yaml, sweep.yaml and study.journal.
     overrides : sequence of str
         Words of Hydra with which the sweep was planned.
     """
     plan = plan_sweep(name, overrides)
     # Points in the order of the plan, not in the order in which they ended.
     files = [points / point / "result.json" for point in plan.points]
-    tabulate_points(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
+    tabulate_points(name, plan.sweep, overrides, files, out)
 
 
 @command("paper best")
@@ -70,11 +73,7 @@ def best(name: Annotated[str, {"argument": True}], results: Folder = Path("resul
 
 
 def tabulate_points(
-    name: str,
-    definition: Mapping[str, Any],
-    overrides: Sequence[str],
-    points: Sequence[Path],
-    out: Path,
+    name: str, sweep: Sweep, overrides: Sequence[str], points: Sequence[Path], out: Path
 ) -> None:
     """Tabulate the points of a sweep and choose the best by its metric.
 
@@ -82,15 +81,16 @@ def tabulate_points(
     ----------
     name : str
         Name of the sweep.
-    definition : mapping
-        Configuration group `Sweep`.
+    sweep : Sweep
+        Checked sweep.
     overrides : sequence of str
         Overrides of the workflow that all points share, its preset first.
     points : sequence of Path
         `result.json` of every point, in the order of the table.
     out : Path
         Folder for `summary.csv` (point, a column per axis, status, reason, epochs, attempt, best,
-        metrics), `cost.csv` (seconds of each training), `best.yaml` and `sweep.yaml`.
+        metrics), `cost.csv` (seconds of each training), `best.yaml`, `sweep.yaml`, and
+        `study.journal`, the study of Optuna.
 
     Raises
     ------
@@ -99,12 +99,20 @@ def tabulate_points(
     SweepError
         If no point has a metric.
     """
-    # The best point by the validation metric; a sweep without any metric has failed.
+    # The study of all points is written as a whole: Optuna itself appends to an earlier file.
     results = [read_json(path) for path in points]
-    best_result = choose(results, definition["metric"], definition["direction"])
-    if best_result is None:
-        reason = f"{results[0]['point']}: {results[0]['reason']}"
-        raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {reason}")
+    with tempfile.TemporaryDirectory() as temporary:
+        journal = Path(temporary, "study.journal")
+        study = create_study(sweep, results, name=name, journal=journal)
+        write_bytes(out / journal.name, journal.read_bytes())
+        # Of equal points, the first is the best; without any metric, the sweep has failed.
+        try:
+            best_result = results[study.best_trial.number]
+        except ValueError:
+            reason = f"{results[0]['point']}: {results[0]['reason']}"
+            message = f"all {len(results)} points of sweep {name} failed; the first, {reason}"
+            raise SweepError(message) from None
+    definition = sweep.model_dump(exclude_none=True)
     # Metrics are the same in every run of a point; its cost is in a table of its own.
     rows = []
     for result in results:
@@ -141,28 +149,6 @@ def tabulate_points(
     write_text(out / "best.yaml", as_yaml(best_point))
 
 
-def choose(
-    results: Sequence[Mapping[str, Any]], metric: str, direction: str
-) -> Mapping[str, Any] | None:
-    """Return the result with the best validation metric, the first of equals.
-
-    None if all points failed.
-
-    Parameters
-    ----------
-    results : sequence of mapping
-        `result.json` of every point.
-    metric : str
-        Name of a metric, such as "validation_mse".
-    direction : str
-        "minimize" or "maximize".
-    """
-    # `min` returns the first of equals.
-    sign = 1.0 if direction == "minimize" else -1.0
-    with_metric = [result for result in results if metric in result["metrics"]]
-    return min(with_metric, key=lambda result: sign * result["metrics"][metric], default=None)
-
-
 def best_overrides(results: Path, name: str) -> list[str]:
     """Return the Hydra overrides of the best point of a sweep.
 
@@ -195,34 +181,25 @@ def best_overrides(results: Path, name: str) -> list[str]:
 
 @command("paper sweep figure")
 def sweep_figure(
-    kind: Annotated[Literal["parallel", "response"], {"argument": True}],
-    definition: File,
-    table: File,
+    kind: Annotated[Literal["parallel", "response", "contours", "importance"], {"argument": True}],
+    study: File,
     out: File,
 ) -> None:
-    """Draw all points at once (parallel), or the metric against each axis (response).
+    """Draw the points of a sweep by their validation metric.
 
-    In the first figure a point is a line through its value on every axis, coloured by its rank; the
-    second has a panel for each axis, with validation and test metric.
+    All at once as lines over the axes (parallel), against each axis (response), over each pair of
+    axes (contours), or the fraction of the metric's variance by axis (importance).
 
     Parameters
     ----------
     kind : str
-        Which of the two figures.
-    definition : Path
-        sweep.yaml of the command `sweep summary`.
-    table : Path
-        summary.csv of the same.
+        Which figure; the last two need a sweep of two axes or more.
+    study : Path
+        study.journal of the command `sweep summary`.
     out : Path
         PNG.
     """
-    sweep_tree = read_yaml(definition)
-    # Axes as text: they may be numbers or names of options.
-    table_of_points = read_table(table, dtype=dict.fromkeys(sweep_tree["space"], str))
-    points = sweep_figures.SweepPoints(table_of_points, sweep_tree)
-    # Both figures take the same points.
-    draw = {
-        "parallel": sweep_figures.draw_parallel_coordinates,
-        "response": sweep_figures.draw_response_curves,
-    }[kind]
-    write_png(draw(points), out)
+    from optuna import load_study
+
+    points = load_study(study_name=None, storage=open_journal(study))
+    write_png(draw_sweep(points, kind), out)

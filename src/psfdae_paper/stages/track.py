@@ -60,6 +60,7 @@ def track(
     alignment: bool = False,
     night: bool = False,
     sweeps: Annotated[tuple[str, ...], {"flag": "--sweep"}] = (),
+    experiment: str = "",
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
 
@@ -80,16 +81,20 @@ def track(
     out : Path
         CSV with the MLflow id of every run and the action.
     stars : sequence of pairs
-        Dataset and its product of the stage stars.
+        Dataset, or variant of the experiment, and its product of the stage stars.
     alignment : bool
         The networks of scene 3.
     night : bool
         The images of a night.
     sweeps : sequence of str
         The points of a sweep.
+    experiment : str
+        Name of an experiment.
     """
-    # Methods, networks of scene 3, images of a night and sweeps; a sweep before its points.
+    # Methods, networks of scene 3, images of a night and sweeps; a sweep or experiment before its
+    # points.
     runs = tracking.read_dataset_runs(results, dict(stars))
+    runs = tracking.join_experiment(results, experiment, runs) if experiment else runs
     runs += tracking.read_alignment_runs(results) if alignment else []
     runs += tracking.read_night_runs(results) if night else []
     runs += [run for sweep in sweeps for run in tracking.read_sweep_runs(results, sweep)]
@@ -217,9 +222,11 @@ def find_experiment(client: MlflowClient, name: str) -> str:
     """
     # A server decides itself where artifacts go.
     location = None if server() else f"mlflow-artifacts:/{name}"
+    if client.get_experiment_by_name(name) is None:
+        with registry.accept_existing():
+            client.create_experiment(name, artifact_location=location)
     experiment = client.get_experiment_by_name(name)
-    if experiment is None:
-        return str(client.create_experiment(name, artifact_location=location))
+    assert experiment is not None
     if location and experiment.artifact_location != location:
         raise TrackingError("mlflow.db: of an earlier version: delete it, and mlartifacts")
     # An experiment that was deleted keeps its name: it is restored.

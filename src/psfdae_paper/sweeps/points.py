@@ -1,4 +1,4 @@
-"""The points of a sweep: every combination or random draws, each with its configuration.
+"""The points of a sweep, each with its configuration.
 
 A `Plan` follows from the name of a sweep and the overrides of the workflow. Each of its points has
 values of the axes, the whole configuration of a training, and a name, the hash of the latter.
@@ -9,15 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import Any
 
-import numpy as np
-
 from psfdae.base.errors import Error, did_you_mean
-from psfdae.base.rng import stream
 from psfdae.base.settings import ConfigError, leaves
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import (
@@ -29,56 +25,11 @@ from psfdae_paper.configuration.compose import (
 )
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.sweep import Axis, Sweep, Value, find_sweeps, load_sweep
+from psfdae_paper.sweeps import study
 
 
 class SweepError(Error, ValueError):
     """A sweep cannot be used; the message names the file or key, and a remedy."""
-
-
-def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
-    """Return every combination of the options of all axes, the last axis fastest.
-
-    No axis may be a range.
-    """
-    # The product of all lists of options, each combination with the names of the axes.
-    names = list(space)
-    return [
-        dict(zip(names, options, strict=True))
-        for options in product(*(space[name].options for name in names))
-    ]
-
-
-def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, Value]]:
-    """Draw random values of all axes, uniform over the options or along the range.
-
-    Each axis has a stream of its own for each draw: more trials extend the list, and
-    the order of axes does not matter.
-    """
-    points: list[dict[str, Value]] = [{} for _ in range(trials)]
-    for i, values in enumerate(points):
-        for name, axis in space.items():
-            rng = stream(seed, "sweep", name, i)
-            if axis.options:
-                values[name] = axis.options[int(rng.integers(len(axis.options)))]
-                continue
-            # Half a step beyond the ends makes all whole numbers equally likely.
-            margin = 0.5 if axis.integer else 0.0
-            ends = np.array([axis.ends[0] - margin, axis.ends[1] + margin])
-            # A logarithmic range is uniform in ln(value).
-            value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
-            values[name] = round_value(axis, float(value))
-    return points
-
-
-def round_value(axis: Axis, value: float) -> int | float:
-    """Round a number of a range to a whole number or four significant digits, inside the range.
-
-    Four digits are enough for a search, and short to paste.
-    """
-    # Rounding may leave the range by half a step or half a digit.
-    if axis.integer:
-        return int(np.clip(round(value), *axis.ends))
-    return float(np.clip(float(f"{value:.4g}"), *axis.ends))
 
 
 def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str, Value]:
@@ -169,11 +120,8 @@ class Plan:
                     keys = {**self.sweep.overrides, **axis.changes(name, value)}
                     self._point_config(keys, {name: value})
             points = [self._point({}, slot) for slot in range(self.sweep.trials or 0)]
-        elif self.sweep.kind == "random":
-            value_sets = draws(self.sweep.space, self.sweep.trials or 0, self.sweep.seed)
-            points = [self._point(values) for values in value_sets]
         else:
-            points = [self._point(values) for values in grid(self.sweep.space)]
+            points = [self._point(values) for values in study.list_values(self.sweep)]
         # A later point of the same name is the same training.
         return {point.name: point for point in points}
 
@@ -198,6 +146,27 @@ class Plan:
         if point.slot is None:
             return []
         return list(self.points.values())[: max(0, point.slot + 1 - self.sweep.parallel)]
+
+    def propose_values(self, point: Point, earlier_results: Sequence[Mapping[str, Any]]) -> Point:
+        """Return a trial of an adaptive sweep with values, which follow from earlier results.
+
+        Parameters
+        ----------
+        point : Point
+            Trial without values.
+        earlier_results : sequence of mappings
+            Results of `earlier_trials`, in their order.
+
+        Raises
+        ------
+        SweepError
+            If the configuration does not allow the values.
+        """
+        assert point.slot is not None
+        earlier_study = study.create_study(self.sweep, earlier_results, point.slot)
+        values = study.ask(earlier_study, self.sweep)
+        keys = {**self.sweep.overrides, **changes(self.sweep.space, values)}
+        return replace(point, values=values, keys=keys, config=self._point_config(keys, values))
 
     def _point(self, values: dict[str, Value], slot: int | None = None) -> Point:
         """Make the point at some values of the axes, or the trial of a number."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.experiment import list_experiments
-from psfdae_paper.workflow.datasets import evaluations
+from psfdae_paper.workflow.datasets import evaluations, stars_file
 from psfdae_paper.workflow.run import Run, exit_in_one_line
 
 
@@ -13,9 +13,9 @@ def experiment_evaluations(run: Run) -> list[str]:
     return [csv for variant in run.variants for csv in evaluations(run, variant.name)]
 
 
-def variant_options(run: Run) -> list[str]:
-    """Return the options of a command with the variants' names, datasets, settings and seeds."""
-    return [f"--variant {v.name} {v.dataset} {v.setting} {v.seed}" for v in run.variants]
+def variant_stars(run: Run) -> list[str]:
+    """Return the options of a command with the stars of each variant of the experiment."""
+    return [f"--stars {variant.name} {stars_file(run, variant.name)}" for variant in run.variants]
 
 
 @exit_in_one_line()
@@ -25,4 +25,7 @@ def experiment_products(run: Run) -> list[str]:
         names = ", ".join(list_experiments())
         raise ConfigError(f"which experiment? --config name=NAME, one of {names}")
     folder = f"{run.results}/experiments/{run.experiment}"
-    return [f"{folder}/{file}" for file in ("errors.csv", "errors.md", "errors.png")]
+    return [
+        *(f"{folder}/{file}" for file in ("errors.csv", "errors.md", "errors.png")),
+        f"{run.results}/mlflow/experiment_{run.experiment}.csv",
+    ]

@@ -9,11 +9,10 @@ from psfdae_paper.configuration.estimators import list_swept_networks
 from psfdae_paper.configuration.sweep import find_sweeps
 from psfdae_paper.source import source_hash
 from psfdae_paper.stages.sweep import training_module
+from psfdae_paper.sweeps.figures import ALL_AXES, TWO_AXES
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
 from psfdae_paper.workflow.datasets import stars_file
 from psfdae_paper.workflow.run import Run, Wildcards, exit_in_one_line
-
-FIGURES = ("parallel", "response")
 
 
 @cache
@@ -72,17 +71,21 @@ def point_threads(run: Run, wildcards: Wildcards) -> int:
 
 @cache
 def sweep_code(run: Run, name: str) -> str:
-    """Return the hash of a point's code: its model's, and the search's of an adaptive sweep."""
+    """Return the hash of a point's code, with the code of its model."""
     sweep = sweep_plan(run, name).sweep
-    # Only adaptive values depend on the code of the search.
-    search = ["psfdae_paper.sweeps.adaptive"] if sweep.kind == "adaptive" else []
     modules = [] if sweep.model in list_swept_networks() else [method(sweep.model).__module__]
-    return source_hash("sweep point", training_module(sweep.model), *modules, *search)
+    return source_hash("sweep point", training_module(sweep.model), *modules)
 
 
 def sweep_results(run: Run, name: str) -> list[str]:
     """Return the results of all points of a sweep."""
     return [result_file(run, name, point) for point in sweep_plan(run, name).points]
+
+
+def sweep_figures(run: Run, name: str) -> list[str]:
+    """Return the figures of a sweep."""
+    kinds = ALL_AXES + TWO_AXES * (len(sweep_plan(run, name).sweep.space) > 1)
+    return [f"{run.results}/sweeps/{name}/figures/{kind}.png" for kind in kinds]
 
 
 @exit_in_one_line()
@@ -93,9 +96,8 @@ def sweep_products(run: Run) -> list[str]:
         names = ", ".join(sorted(find_sweeps()))
         raise SweepError(f"which sweep? --config sweep=NAME, one of {names}")
     sweep_plan(run, name)
-    folder = f"{run.results}/sweeps/{name}"
     return [
-        *(f"{folder}/{file}" for file in ("summary.csv", "best.yaml")),
-        *(f"{folder}/figures/{kind}.png" for kind in FIGURES),
+        *(f"{run.results}/sweeps/{name}/{file}" for file in ("summary.csv", "best.yaml")),
+        *sweep_figures(run, name),
         f"{run.results}/mlflow/sweep_{name}.csv",
     ]

@@ -15,12 +15,12 @@ from psfdae.methods.metrics import (
     mse,
     ssim,
 )
+from psfdae_paper.configuration.experiment import Variant
 from psfdae_paper.evaluation import readable
 from psfdae_paper.evaluation.alignment_tables import correlate_errors
 from psfdae_paper.evaluation.experiments import (
     NUMBERS,
     ROW,
-    Variant,
     compare_settings,
     draw_experiment,
     format_settings,
@@ -151,7 +151,7 @@ def test_correlation_is_pearson_s_with_fisher_s_interval():
 # Experiments
 
 VARIANTS = [
-    Variant(f"v{setting}{seed}", "dataset3", setting, seed)
+    Variant("dataset3", setting, seed, (f"noise.law={setting}", f"seed={seed}"))
     for setting in ("paper", "b", "a")
     for seed in (1, 2, 3)
 ]
@@ -205,10 +205,12 @@ def test_the_table_and_the_figure_of_an_experiment_show_all_settings():
     (panel,) = figure.axes
     assert [bars.get_label() for bars in panel.containers] == ["paper", "b", "a"]
     line, *_ = panel.containers[0]
-    assert line.get_xydata() == pytest.approx(np.array([[1e-3, 1.0], [2e-3, 1.0]]))
+    # Three settings stand side by side.
+    expected = np.array([[1e-3 / 1.015, 1.0], [2e-3 / 1.015, 1.0]])
+    assert line.get_xydata() == pytest.approx(expected)
     _, _, (bars,) = panel.containers[2]
     assert bars.get_segments()[0][:, 1] == pytest.approx(3.2 + np.array([-0.1, 0.1]) / 3**0.5)
-    assert (panel.get_title(), panel.get_xlabel()) == ("DAE", "noise level λ")
+    assert (panel.get_title(), panel.get_xlabel()) == ("DAE", "noise level λ (× 10⁻³)")
     assert figure.get_supylabel() == "MSE / MSE of paper"
     # The first setting need not have the first level.
     later = draw_experiment(table[(table.setting != "paper") | (table.noise_level > 1e-3)], "mine")
@@ -220,6 +222,6 @@ def test_the_table_and_the_figure_of_an_experiment_show_all_settings():
     ]
     apart = draw_experiment(rows.assign(ratio=rows.ratio.where(rows.setting == "paper")), "mine")
     line, _, (bars,) = apart.axes[0].containers[0]
-    assert line.get_xydata() == pytest.approx(np.array([[1e-3, 2e-6]]))
+    assert line.get_xydata() == pytest.approx(np.array([[1e-3 / 1.015**0.5, 2e-6]]))
     assert bars.get_segments()[0][:, 1] == pytest.approx(2e-6 + np.array([-1, 1]) * 1e-6 / 3**0.5)
     assert "3 seeds of 50 test stars" in figure.get_suptitle()

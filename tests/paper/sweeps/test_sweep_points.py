@@ -7,6 +7,7 @@ import json
 import shlex
 
 import numpy as np
+import optuna
 import pandas as pd
 import pytest
 import yaml
@@ -17,11 +18,14 @@ from psfdae.methods import list_groups
 from psfdae.stars.splits import random_split
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load, load_stage
-from psfdae_paper.configuration.sweep import list_point_groups
+from psfdae_paper.configuration.sweep import Sweep, list_point_groups
 from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
+from psfdae_paper.sweeps import points
+from psfdae_paper.sweeps.figures import ALL_AXES, TWO_AXES, draw_sweep
 from psfdae_paper.sweeps.measurement import Task
+from psfdae_paper.sweeps.study import open_journal
 from psfdae_paper.tracking import find_stars
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
@@ -61,9 +65,9 @@ class Point:
             checkpoint=root / f"{name}.pt",
         )
 
-    def run(self, *overrides, model="dae", values=None, keys=None, trial=None):
+    def run(self, *overrides, model="dae"):
         config = load_stage(list_point_groups(model), (*TINY, *overrides))
-        stage.point(config, model, values or {}, keys or {}, self.task, trial)
+        stage.point(config, model, points.Point(self.folder.name, {}, {}, {}), self.task)
         return self.result()
 
     def result(self):
@@ -160,7 +164,7 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
         checkpoint=tmp_path / "sweep.pt",
     )
     settings = load_stage(list_point_groups("noise_trained"), (*Alignment.choice, *overrides))
-    stage.point(settings, "noise_trained", {}, {}, task)
+    stage.point(settings, "noise_trained", points.Point(folder.name, {}, {}, {}), task)
     metrics = read_json(folder / "result.json")["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):
         table = pd.read_csv(folder / name)
@@ -169,15 +173,21 @@ def test_network_of_scene_3_is_measured_on_other_states(tmp_path):
         assert metrics[f"{role}_mae"] == pytest.approx(mean, rel=1e-7)
 
 
-def test_trial_trains_the_number_that_it_asked_for(point):
-    space = {"train.lr": {"low": 1e-3, "high": 1e-2, "log": True}}
-    search = {"space": space, "seed": 1, "startup": 2, "metric": "validation_mse"}
-    search |= {"direction": "minimize"}
-    result = point.run(trial=stage.Trial(0, search, ()))
-    lr = result["values"]["train.lr"]
-    assert 1e-3 <= lr <= 1e-2
-    config = yaml.safe_load((point.folder / "config.yaml").read_text())
-    assert config["train"]["lr"] == lr
+def test_trial_trains_the_number_that_it_asked_for(tmp_path, stars, config_folder):
+    tree = {**DEFINITION, "kind": "adaptive", "trials": 3, "parallel": 1}
+    tree["space"] = {"train.lr": {"low": 1e-3, "high": 1e-2, "log": True}}
+    (config_folder / "sweep/tried.yaml").write_text(yaml.safe_dump({"tried": tree}))
+    # An earlier result is read, and its values are others.
+    values = []
+    for name in list(points.plan_sweep("tried", TINY[1:]).points)[:2]:
+        folder = tmp_path / name
+        stage.sweep_point("tried", (("stars", stars),), tmp_path / "a.pt", folder, TINY[1:])
+        result = read_json(folder / "result.json")
+        lr = result["values"]["train.lr"]
+        assert 1e-3 <= lr <= 1e-2 and result["keys"] == {"train.lr": lr}
+        assert yaml.safe_load((folder / "config.yaml").read_text())["train"]["lr"] == lr
+        values.append(lr)
+    assert len(set(values)) == 2
 
 
 def write_points(root, outcomes):
@@ -211,7 +221,10 @@ def write_points(root, outcomes):
 DEFINITION = {
     **{"kind": "grid", "model": "dae", "dataset": "dataset3"},
     **{"metric": "validation_mse", "direction": "minimize"},
-    "space": {"width": {"values": [4, 8]}, "train.lr": {"values": [0.001, 0.004]}},
+    "space": {
+        "width": {"keys": ["dae.widths"], "values": [4, 8], "repeat": 9},
+        "train.lr": [0.001, 0.004],
+    },
 }
 OUTCOMES = [(4, 0.001, 3e-5), (4, 0.004, 2e-5), (8, 0.001, None), (8, 0.004, 1e-5)]
 OVERRIDES = ("preset=smoke", "train.epochs=3")
@@ -220,7 +233,8 @@ OVERRIDES = ("preset=smoke", "train.epochs=3")
 def summarise(root, outcomes=OUTCOMES, **changes):
     out = root / "sweeps/tried"
     files = write_points(root, outcomes)
-    sweep_summary.tabulate_points("tried", {**DEFINITION, **changes}, OVERRIDES, files, out)
+    sweep = Sweep.model_validate({**DEFINITION, **changes})
+    sweep_summary.tabulate_points("tried", sweep, OVERRIDES, files, out)
     return out
 
 
@@ -233,13 +247,58 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     overrides = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
     assert overrides == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
     load_stage(list_groups("dae"), ("preset=smoke", *shlex.split(overrides)))
-    # Errors on the test stars choose nothing.
-    results = [read_json(path) for path in write_points(tmp_path, OUTCOMES)]
-    for number, result in enumerate(results):
+    # The test errors of this file would choose another point.
+    files = write_points(tmp_path, OUTCOMES)
+    for number, path in enumerate(files):
+        result = read_json(path)
         result["metrics"]["test_mse"] = number
+        path.write_text(json.dumps(result))
     for direction, number in (("minimize", 3), ("maximize", 0)):
-        best_point = sweep_summary.choose(results, "validation_mse", direction)
-        assert best_point["point"] == f"{number:012x}"
+        sweep = Sweep.model_validate({**DEFINITION, "direction": direction})
+        sweep_summary.tabulate_points("tried", sweep, OVERRIDES, files, out)
+        assert yaml.safe_load((out / "best.yaml").read_text())["point"] == f"{number:012x}"
+
+
+def test_study_of_a_sweep_is_readable_by_optuna(tmp_path):
+    out = summarise(tmp_path)
+    # Written again, it has no trial twice.
+    summarise(tmp_path)
+    storage = open_journal(out / "study.journal")
+    study = optuna.load_study(study_name="tried", storage=storage)
+    table = pd.read_csv(out / "summary.csv", dtype={"point": str})
+    assert [trial.user_attrs["point"] for trial in study.trials] == table.point.tolist()
+    assert study.best_params == {"width": 8, "train.lr": 0.004}
+    failed = study.get_trials(states=[optuna.trial.TrialState.FAIL])
+    assert [trial.number for trial in failed] == [2]
+    # Distances of numbers are kept in figures, widths on a linear scale.
+    assert not study.trials[0].distributions["width"].log
+
+
+def test_points_without_any_metric_end_in_one_line(tmp_path):
+    failed = [(*values, None) for *values, _ in OUTCOMES]
+    with pytest.raises(points.SweepError, match=f"all 4 .* {0:012x}: the network died"):
+        summarise(tmp_path, failed)
+
+
+# All but one point failed: Optuna has nothing to compare.
+LONE = [(width, lr, score and None) for width, lr, score in OUTCOMES[:3]] + OUTCOMES[3:]
+
+
+@pytest.mark.parametrize("outcomes", [OUTCOMES, LONE, [(4, 0.001, 1e-5), (8, 0.001, 1e-5)]])
+def test_figures_show_every_point_or_say_why_not(tmp_path, outcomes):
+    out = summarise(tmp_path, outcomes)
+    for kind in ALL_AXES + TWO_AXES:
+        path = out / f"{kind}.png"
+        sweep_summary.sweep_figure(kind, out / "study.journal", path)
+        assert path.read_bytes().startswith(b"\x89PNG")
+    study = optuna.load_study(study_name="tried", storage=open_journal(out / "study.journal"))
+    figure = draw_sweep(study, "response")
+    count = sum(score is not None for *_, score in outcomes)
+    for panel in figure.axes[:2]:
+        drawn = panel.collections[0].get_offsets()
+        assert len(drawn) == count and drawn[:, 1].min() == pytest.approx(10)
+    has_failed = count < len(outcomes)
+    assert figure.get_suptitle().endswith("failed" if has_failed else "points")
 
 
 def test_stars_of_a_point_have_its_settings(tmp_path):
@@ -280,7 +339,8 @@ def test_sweep_is_a_parent_run_with_a_child_per_point(site):
     best_run = children["width=8, train.lr=0.004"].data
     assert best_run.metrics["test_mse_1e-6"] == pytest.approx(11)
     # A grid that has grown is another parent: old points move to it and are not doubled.
-    space = {**DEFINITION["space"], "width": {"values": [4, 8, 16]}}
+    width = {**DEFINITION["space"]["width"], "values": [4, 8, 16]}
+    space = {**DEFINITION["space"], "width": width}
     summarise(site.results, [*OUTCOMES, (16, 0.004, 2e-5)], space=space)
     assert actions() == ["created", *["unchanged"] * 4, "created"]
     parents = {run.data.tags.get("mlflow.parentRunId") for run in runs().values()}

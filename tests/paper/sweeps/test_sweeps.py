@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,9 +12,9 @@ import yaml
 from psfdae.base.files import ProductError
 from psfdae.base.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.configuration.sweep import Axis, find_sweeps, load_sweep
-from psfdae_paper.sweeps import adaptive
-from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep
+from psfdae_paper.configuration.sweep import Sweep, find_sweeps, load_sweep
+from psfdae_paper.sweeps.points import SweepError, plan_sweep
+from psfdae_paper.sweeps.study import ask, create_study, list_values
 
 GRID = {
     "kind": "grid",
@@ -25,7 +27,6 @@ GRID = {
         "train.lr": [0.001, 0.004],
     },
 }
-SEARCH = {"seed": 3, "startup": 4, "metric": "validation_mse", "direction": "minimize"}
 
 
 @pytest.fixture
@@ -53,8 +54,14 @@ def test_grid_has_every_combination_once(sweep):
     )
     assert points[2].config["dae"]["widths"] == [8] * 9
     assert points[3].config["train"]["lr"] == 0.004
-    choices = axes(a=[1, 2], b={"choices": {3: {"x": 1}, 4: {"x": 2}}})
-    assert grid(choices) == [{"a": i, "b": j} for i in (1, 2) for j in ("3", "4")]
+    # Optuna's own order of axes is alphabetic, and its grid is shuffled.
+    space = {
+        "train.lr": [0.002, 0.001],
+        "a": {"choices": {3: {"dae.residual": True}, 4: {"dae.residual": False}}},
+        "dae.widths": [[4] * 9, [8] * 9],
+    }
+    values = [tuple(v.values()) for v in list_values(make_sweep(space=space))]
+    assert values == list(product(space["train.lr"], ("3", "4"), space["dae.widths"]))
 
 
 def test_names_depend_on_content_not_on_order_or_format(sweep):
@@ -119,65 +126,79 @@ def test_damaged_file_and_unknown_name_are_named(sweep, config_folder):
         load_sweep("nothing")
 
 
-def axes(**space):
-    return {name: Axis.model_validate(axis) for name, axis in space.items()}
+def make_sweep(**changes):
+    """A checked sweep, without a file."""
+    return Sweep.model_validate({**GRID, **changes})
 
 
-def test_draws_extend_and_each_axis_is_on_its_own():
-    space = axes(a={"low": 1, "high": 9, "integer": True}, b={"low": 1e-4, "high": 1, "log": True})
-    assert draws(space, 9, seed=5)[:4] == draws(space, 4, seed=5)
-    single_axis = [point["b"] for point in draws({"b": space["b"]}, 4, seed=5)]
-    assert single_axis == [point["b"] for point in draws(space, 4, seed=5)]
-    assert draws(space, 4, seed=6) != draws(space, 4, seed=5)
+def draw_values(trials, seed, space):
+    """Random draws of a sweep."""
+    return list_values(make_sweep(kind="random", trials=trials, seed=seed, space=space))
+
+
+DRAWS = {
+    "whole": {"keys": ["train.batch"], "low": 1, "high": 4, "integer": True},
+    "even": {"keys": ["train.grad_clip"], "low": 2, "high": 4},
+    "train.lr": {"low": 1e-4, "high": 1, "log": True},
+    "train.optimiser": ["adam", "muon"],
+}
+
+
+def test_more_draws_extend_the_list_and_another_seed_has_others():
+    first = draw_values(4, 5, DRAWS)
+    assert draw_values(9, 5, DRAWS)[:4] == first
+    assert draw_values(4, 6, DRAWS) != first
+    # Seeds may be larger than numpy's older generators allow.
+    assert len(draw_values(4, 2**62, DRAWS)) == 4
 
 
 def test_draws_fill_their_range_evenly():
-    space = axes(
-        whole={"low": 1, "high": 4, "integer": True},
-        even={"low": 2, "high": 4},
-        log={"low": 1e-4, "high": 1, "log": True},
-        listed=["x", "y"],
-    )
-    points = pd.DataFrame(draws(space, 500, seed=1))
+    points = pd.DataFrame(draw_values(500, 1, DRAWS))
     # Five standard deviations of a binomial with 500 trials of probability 1/4 and 1/2.
     assert np.abs(np.bincount(points.whole)[1:] - 125).max() < 5 * np.sqrt(500 * 0.25 * 0.75)
-    assert abs((points.listed == "x").sum() - 250) < 5 * np.sqrt(500 * 0.25)
-    for unit in ((points.even - 2) / 2, np.log10(points.log) / 4 + 1):
+    assert abs((points["train.optimiser"] == "adam").sum() - 250) < 5 * np.sqrt(500 * 0.25)
+    for unit in ((points.even - 2) / 2, np.log10(points["train.lr"]) / 4 + 1):
         # Mean 1/2 and variance 1/12, whose own variances are 1/12n and 1/180n.
         assert abs(unit.mean() - 0.5) < 5 / np.sqrt(12 * 500)
         assert abs(unit.var() - 1 / 12) < 5 / np.sqrt(180 * 500)
 
 
-SPACE = axes(
-    x={"low": -4.0, "high": 4.0},
-    kind={"choices": {"good": {"k": 0}, "bad": {"k": 1}}},
-    list=[[1, 2], [3, 4]],
-)
+SPACE = {
+    "x": {"keys": ["train.grad_clip"], "low": 0.0, "high": 8.0},
+    "kind": {"choices": {"good": {"train.lr": 0.1}, "bad": {"train.lr": 0.2}}},
+    "list": {"keys": ["dae.widths"], "values": [[1, 2], [3, 4]]},
+}
+SEARCH = make_sweep(kind="adaptive", trials=9, space=SPACE, seed=3)
 
 
-def outcome(slot, values, status="finished"):
+def outcome(slot, values, is_finished=True):
     """Result of a trial on a parabola."""
-    loss = (values["x"] - 1.5) ** 2 + (values["kind"] == "bad")
-    metrics = {"validation_mse": loss} if status == "finished" else {}
-    name = f"{slot:012x}"
-    return {"slot": slot, "point": name, "values": values, "status": status, "metrics": metrics}
+    loss = (values["x"] - 5.5) ** 2 + (values["kind"] == "bad")
+    metrics = {"validation_mse": loss} if is_finished else {}
+    return {"slot": slot, "point": f"{slot:012x}", "values": values, "metrics": metrics}
 
 
-def run_trials(count):
+def run_trials(count, sweep=SEARCH):
     results = []
     for slot in range(count):
-        values = adaptive.ask(SPACE, SEARCH, slot, results)
-        results.append(outcome(slot, values, "failed" if slot == 2 else "finished"))
+        values = ask(create_study(sweep, results, slot), sweep)
+        results.append(outcome(slot, values, is_finished=slot != 2))
     return results
 
 
 def test_asking_is_a_function_of_what_is_known():
     results = run_trials(8)
     assert run_trials(8) == results
-    repeated = adaptive.ask(SPACE, SEARCH, 8, results)
-    assert adaptive.ask(SPACE, SEARCH, 8, results[::-1]) == repeated
-    assert repeated["list"] in ([1, 2], [3, 4])
-    assert adaptive.ask(SPACE, {**SEARCH, "seed": 4}, 8, results) != repeated
+    assert all(result["values"]["list"] in ([1, 2], [3, 4]) for result in results)
+    assert run_trials(8, make_sweep(**{**SEARCH.model_dump(exclude_none=True), "seed": 4})) != (
+        results
+    )
+
+
+def test_later_trials_are_near_the_best_of_earlier_ones():
+    """Values of a uniform draw would be 2.8 from the minimum in the mean."""
+    distances = [abs(result["values"]["x"] - 5.5) for result in run_trials(40)[20:]]
+    assert np.mean(distances) < 1.4
 
 
 def test_trial_waits_for_all_but_those_beside_it(sweep):

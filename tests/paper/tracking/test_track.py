@@ -12,13 +12,18 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from mlflow.exceptions import MlflowException
 
-from psfdae.base.files import write_text
-from psfdae_paper import tracking
+from psfdae.base.files import Column, write_product, write_text
+from psfdae.methods import method
+from psfdae_paper import registry, tracking
 from psfdae_paper.configuration.estimators import Estimator, list_trained_networks
+from psfdae_paper.configuration.experiment import Experiment
+from psfdae_paper.stages import experiment as experiment_stage
 from psfdae_paper.stages import track
 from psfdae_paper.tracking import read_dataset_runs
 from tracked_results import ALL, write_config, write_history, write_stars, write_tree
@@ -115,6 +120,13 @@ def test_best_has_the_smallest_validation_error_on_the_same_stars(site):
 
 
 def test_a_method_without_a_validation_error_has_no_best(site):
+    """A method that is fitted to its validation stars says so."""
+    for kind in (method("gmm"), method("dae")):
+        registry.register(site.client, kind.name, kind)
+    models = {model.name: model.description for model in site.client.search_registered_models()}
+    assert "no validation error" in models["gmm"] and not models["dae"]
+    for name in models:
+        site.client.delete_registered_model(name)
     write_history(site.dae / "history.csv", [(1, 3e-5, "nan", 1.5)])
     site.track()
     (model,) = site.client.search_registered_models()
@@ -162,6 +174,91 @@ def test_killed_import_is_repaired(site, monkeypatch):
     runs = [run for kind in ALL for run in site.runs(kind)]
     assert [run.info.status for run in runs] == ["FINISHED"] * 3
     assert len(site.client.search_model_versions()) == 1
+
+
+@pytest.mark.parametrize(
+    ("create", "name"),
+    [("create_registered_model", "dataset3-dae"), ("create_experiment", "scene1")],
+)
+def test_two_importers_of_a_server_do_not_stop_each_other(site, monkeypatch, create, name):
+    """The other importer creates a name just before this one does."""
+    from mlflow import MlflowClient
+
+    original, calls = getattr(MlflowClient, create), []
+
+    def create_second(client, *arguments, **options):
+        if not calls:
+            original(client, *arguments, **options)
+        calls.append(arguments[0])
+        return original(client, *arguments, **options)
+
+    monkeypatch.setattr(MlflowClient, create, create_second)
+    assert site.track() == dict.fromkeys(ALL, "created")
+    assert calls[0] == name
+    # Any other error of the database is not accepted.
+    with pytest.raises(MlflowException, match="Missing value"):
+        registry.register(site.client, "", method("dae"))
+
+
+def test_experiment_is_a_parent_run_with_a_child_per_method_and_variant(site):
+    """Children have dataset, setting, overrides and seed, and no registered model."""
+    definition = Experiment(
+        datasets=["dataset3"],
+        overrides={"dataset.splits": ["random"]},
+        settings={"paper": {}, "low": {"noise.levels": [0.003]}},
+        seeds=[7, 8],
+    )
+    stars = {variant.name: site.results / f"{variant.seed}.h5" for variant in definition.variants}
+    for variant in definition.variants:
+        write_stars(stars[variant.name], seed=variant.seed)
+        copy_variant(site, variant)
+    evaluations = [site.results / f"evaluation/{name}/random-template.csv" for name in stars]
+    folder = site.results / "experiments/mine"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment_stage, "load_experiment", lambda name: definition)
+        experiment_stage.experiment("mine", evaluations, ("preset=smoke",), folder)
+    experiment_stage.figure_experiment(folder / "errors.csv", "mine", folder / "errors.png")
+
+    def actions():
+        receipt = site.results / "receipt.csv"
+        options = {"stars": tuple(stars.items()), "experiment": "mine"}
+        track.track(site.results, "smoke", site.database, receipt, **options)
+        return pd.read_csv(receipt).action.tolist()
+
+    assert actions() == ["created"] * (1 + 4 * 3)
+    assert actions() == ["unchanged"] * (1 + 4 * 3)
+    runs = {run.info.run_name: run for run in site.runs("", "experiment_mine")}
+    parent = runs.pop("experiment mine")
+    assert parent.data.params["settings.low.noise.levels"] == "[0.003]"
+    assert parent.data.params["given"] == '["preset=smoke"]'
+    child = runs["dae dataset3 low seed=8"].data
+    assert child.tags["mlflow.parentRunId"] == parent.info.run_id
+    assert child.tags["setting"] == "low"
+    assert child.tags["overrides"] == "dataset.splits=[random] noise.levels=[0.003] seed=8"
+    assert (child.params["dataset"], child.params["seed"]) == ("dataset3", "8")
+    assert child.metrics["test_mse_1e-6"] == pytest.approx(30)
+    assert len(runs) == 12 and not site.client.search_registered_models()
+
+
+def copy_variant(site, variant):
+    """Files of dataset 3, as if a variant had them with its seed."""
+    stems = ("evaluation/{}", "dae/{}", "pca_som/{}")
+    for stem in stems:
+        source = site.results / stem.format("dataset3")
+        shutil.copytree(source, site.results / stem.format(variant.name))
+    table = site.results / f"evaluation/{variant.name}/random-template.csv"
+    table.write_text(table.read_text().replace("dataset3", variant.name))
+    config = site.results / f"dae/{variant.name}/random-template/config.yaml"
+    tree = yaml.safe_load(config.read_text()) | {"seed": variant.seed}
+    config.write_text(yaml.safe_dump(tree))
+    values = {"a": Column(np.arange(3.0), "1", "values")}
+    baseline = {"seed": variant.seed, "baseline": {"components": 2}}
+    path = site.results / f"pca_som/{variant.name}/random.h5"
+    write_product(path, "pca_som", values, baseline)
+    settings = {group: tree[group] for group in ("seed", "noise", "parts", "split", "reference")}
+    write_product(
+        table.with_suffix(".h5"), "restored", values, settings | {"dataset": variant.name}
+    )
 
 
 def test_unreachable_server_costs_a_message(site, monkeypatch, capsys):
