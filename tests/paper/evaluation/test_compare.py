@@ -240,6 +240,8 @@ def test_tables_that_lack_a_standard_error_are_compared(tmp_path):
             assert set(values.verdict) <= {"equal"} and column not in set(values.column)
             lacking.append(column)
     assert {"n", "variance", "stderr", "mse_stderr", "ci_low", "stars"} <= {*lacking}
+
+
 def test_errors_of_scene_3_scatter_as_measured():
     """Of very many states, whose own scatter is 0; the largest of the networks' scatters."""
     rows = pd.read_csv(ROOT / "studies/seed_scatter/alignment.csv")
