@@ -199,7 +199,7 @@ def main(results, architecture, optimiser, seconds, lr):  # noqa: PLR0915
     )
     rng, levels = np.random.default_rng(0), np.array(config.noise.levels)
     # The linear estimate, and the stars on which errors are measured.
-    statistics = measure_statistics(stars.draw(40_000, rng)[0], levels, config.grid.points)
+    statistics = measure_statistics(stars.draw(40_000, rng), levels, config.grid.points)
     mean, axes, variance = (
         torch.from_numpy(statistics[name].astype(np.float32))
         for name in ("mean", "axes", "variance")

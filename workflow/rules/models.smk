@@ -124,6 +124,26 @@ use rule train as fit_posterior_network_position with:
         "Training the posterior network with positions on {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
 
 
+use rule train as fit_posterior_network_refined with:
+    input:
+        unpack(fits.start_files(RUN, "posterior_network_refined")),
+        stars=lambda w: datasets.stars_file(RUN, w.dataset),
+    output:
+        fits.fit_outputs(RUN, "posterior_network_refined"),
+    log:
+        f"{RESULTS}/logs/fit_posterior_network_refined/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/fit_posterior_network_refined/{{dataset}}/{{split}}-{{reference}}.tsv"
+    priority: fits.fit_resources("posterior_network_refined")["runtime"]
+    threads: fits.fit_threads(RUN, "posterior_network_refined")
+    resources:
+        **fits.fit_resources("posterior_network_refined"),
+    params:
+        **fits.fit_params(RUN, "posterior_network_refined"),
+    message:
+        "Training the posterior network with refined wavefronts on {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+
+
 use rule train as fit_field with:
     input:
         unpack(fits.start_files(RUN, "field")),

@@ -17,13 +17,17 @@ noise level. As the sum of all stamps is 1, the sum of all estimates is 1, too.
 A telescope of rotational symmetry has mirrored stars at mirrored positions. The layers commute with
 these mirror images (group convolutions, Cohen & Welling 2016, ICML 48, 2990): every hidden
 feature exists once for each symmetry, with the same weights.
+
+For stars with random Seidel aberrations, another layer may propose wavefronts: a mixture of
+Gaussians of the eight coefficients of pupil monomials on which a stamp depends
+(`WavefrontCoordinates`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,27 +36,92 @@ from torch.nn import functional
 
 from psfdae.base.rng import stream
 from psfdae.methods.interface import TrainingSet
-from psfdae.methods.networks.training import Adam, Muon, Row, Training, use_half_precision
+from psfdae.methods.networks.training import Muon, Row, Training, use_half_precision
+from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.bounds.estimates import simulate_fresh_stars
 from psfdae_paper.bounds.posterior import Bank, compute_symmetry_weights, list_jitters
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.configuration.wavefront import VonKarman
-from psfdae_paper.stars.framing import Propagation
-from psfdae_paper.stars.scenes import template_wavefronts
-from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
+from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.stars.symmetry import SYMMETRIES
 
 POSITION_TERMS = 9
 """Terms of a polynomial of third order in two coordinates, without the constant."""
 
 
-def list_symmetries(config: Config) -> tuple[Symmetry, ...]:
-    """Return the symmetries of a scene: of a square, or the identity alone for turbulence."""
-    return SYMMETRIES[:1] if isinstance(config.wavefront, VonKarman) else SYMMETRIES
+# The wavefronts of stars.
+
+
+class WavefrontCoordinates:
+    """Coordinates of the wavefronts that give a stamp, which mirror images permute up to signs.
+
+    A stamp depends on the coefficients of the eight pupil monomials, with tilts that move it from
+    the chief ray to its place. Spherical aberration and coma are balanced by focus and tilt, so
+    that errors of the coordinates are nearly independent. The middle is the pixel d // 2, about
+    which stamps are mirrored.
+    """
+
+    size = len(MONOMIALS)
+
+    to_coordinates = np.zeros((size, size))
+    """Matrix from coefficients (r4, r2x, r2y, xx, xy, yy, x, y), in rows: spherical aberration,
+    coma, focus, astigmatism, tilts."""
+    to_coordinates[[0, 1, 2, 3, 6, 7], [0, 1, 2, 0, 6, 7]] = 1.0
+    to_coordinates[3, [3, 5]] = to_coordinates[5, 4] = 0.5
+    to_coordinates[4, [3, 5]] = 0.5, -0.5
+    to_coordinates[[6, 7], [1, 2]] = 2.0 / 3.0
+
+    @classmethod
+    def encode(cls, coefficients: np.ndarray, pixel: float) -> np.ndarray:
+        """Return coordinates (n, 8) of coefficients (n, 8) about the middle of a stamp.
+
+        `pixel` is the width of a pixel in λ/D.
+        """
+        about_middle = coefficients.copy()
+        # From the corner of the stamp's middle to the pixel at d // 2: half a pixel along x and y.
+        about_middle[:, -2:] -= 0.25 * pixel
+        return np.asarray(about_middle @ cls.to_coordinates.T)
+
+    @classmethod
+    def decode(cls, coordinates: np.ndarray, pixel: float) -> np.ndarray:
+        """Return the coefficients (..., 8) of coordinates (..., 8), the inverse of `encode`."""
+        coefficients = coordinates @ np.linalg.inv(cls.to_coordinates).T
+        coefficients[..., -2:] += 0.25 * pixel
+        return np.asarray(coefficients)
+
+    @classmethod
+    def mirror(cls) -> np.ndarray:
+        """Return the matrices (8, 8, 8) that move the coordinates of stars by `SYMMETRIES`."""
+        matrices = np.zeros((len(SYMMETRIES), cls.size, cls.size))
+        for matrix, symmetry in zip(matrices, SYMMETRIES, strict=True):
+            matrix[[0, 3], [0, 3]] = 1.0
+            matrix[1:3, 1:3] = matrix[6:, 6:] = symmetry.matrix
+            # x² − y² changes its sign with an exchange of x and y, xy with a single flip.
+            matrix[4, 4] = 1 - 2 * symmetry.transpose
+            matrix[5, 5] = 1 - 2 * (symmetry.flip_rows != symmetry.flip_columns)
+        return matrices
 
 
 # Stars that are drawn without end.
+
+
+class DrawnStars(NamedTuple):
+    """Stamps with the properties that a training uses.
+
+    Attributes
+    ----------
+    stamps : ndarray, shape (n, P)
+        Noise-free stamps of sum 1.
+    position : ndarray of int, shape (n, 2)
+        Grid indices of their fields.
+    wavefront : ndarray, shape (n, 8) or (n, 0)
+        `WavefrontCoordinates`; none without random Seidel aberrations.
+    """
+
+    stamps: np.ndarray
+    position: np.ndarray
+    wavefront: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -65,86 +134,105 @@ class FreshStars:
         Framed stars with a margin.
     field : ndarray of int, shape (M,)
         Field of each star.
+    peak : ndarray of int, shape (M, 2)
+        Brightest pixel (row, column) from the chief ray.
+    seidel : ndarray, shape (M, 5) or (M, 0)
+        Seidel coefficients in waves; none for other wavefronts.
     choices : ndarray of int, shape (C, 2)
         Star and symmetry of stamps that are equally likely; some are listed several times.
     pixels : ndarray of int, shape (G, J, P)
         Pixels of a frame that are the stamp at each symmetry and centring error.
-    points : int
-        Field points along a side.
+    relative_field : ndarray, shape (F, 2)
+        Field vectors, 1 at the edge on an axis.
+    pixel : float
+        Width of a pixel in λ/D.
     """
 
     frames: np.ndarray
     field: np.ndarray
+    peak: np.ndarray
+    seidel: np.ndarray
     choices: np.ndarray
     pixels: np.ndarray
-    points: int
+    relative_field: np.ndarray
+    pixel: float
 
     @classmethod
-    def simulate(cls, config: Config, number: int, count: int, fields: np.ndarray) -> FreshStars:
+    def simulate(
+        cls, config: Config, number: int | str, count: int, fields: np.ndarray
+    ) -> FreshStars:
         """Simulate a set of stars.
 
         Parameters
         ----------
         config : Config
             Settings with the groups of `consistency.SIMULATION`.
-        number : int
-            Number of the set; each has other stars.
+        number : int or str
+            Number or name of the set; each has other stars.
         count : int
-            Stars of the set. Turbulence has one star for each field.
+            Stars of the set.
         fields : ndarray of bool, shape (F,)
             Fields in which stamps are drawn.
         """
         framing, points = config.framing, config.grid.points
         margin = framing.jitter_px + Bank.mirror_margin
-        symmetries = list_symmetries(config)
-        if len(symmetries) > 1:
-            columns = simulate_fresh_stars(config, f"network{number}", count)
-            frames, field = columns["framed"].values, columns["field_index"].values
-            times = compute_symmetry_weights(field, columns["peak"].values, points)
-        else:
-            # Static PSFs: nothing of a star is random but its field, centring error and noise.
-            source = template_wavefronts(config)
-            optics = (config.telescope, config.optics, framing, framing.search_px)
-            frames = Propagation(source, *optics).frame(framing.stamp_px + 2 * margin)[0]
-            field = np.arange(len(frames))
-            times = np.ones((len(frames), 1), int)
+        columns = {
+            name: column.values
+            for name, column in simulate_fresh_stars(config, f"network{number}", count).items()
+        }
+        frames, field, peak = (columns[name] for name in ("framed", "field_index", "peak"))
+        seidel = columns.get("seidel", np.empty((len(field), 0)))
+        times = compute_symmetry_weights(field, peak, points)
         # Mirrored stars are at mirrored fields, which may be left out.
-        mirrored = np.stack([s.field(field, points) for s in symmetries], axis=1)
+        mirrored = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
         star, symmetry = np.nonzero(times * fields[mirrored])
         choices = np.stack([star, symmetry], axis=1).repeat(times[star, symmetry], axis=0)
         # Windows of all symmetries and centring errors, as pixels of the flat frame.
         size, side = frames.shape[-1], framing.stamp_px
         index = np.arange(size**2).reshape(size, size)
-        pixels = np.empty((len(symmetries), len(list_jitters(framing.jitter_px)), side**2), int)
-        for g, symmetry_of_square in enumerate(symmetries):
+        pixels = np.empty((len(SYMMETRIES), len(list_jitters(framing.jitter_px)), side**2), int)
+        for g, symmetry_of_square in enumerate(SYMMETRIES):
             for j, jitter in enumerate(list_jitters(framing.jitter_px)):
                 row, column = symmetry_of_square.window(jitter, margin)
                 window = index[row : row + side, column : column + side]
                 pixels[g, j] = symmetry_of_square.image(window).ravel()
         flat = frames.reshape(len(frames), -1).astype(np.float32)
-        return cls(flat, field, choices, pixels, points)
+        place = relative_field(config.grid), config.telescope.pixel
+        return cls(flat, field, peak, seidel, choices, pixels, *place)
 
     def add(self, other: FreshStars) -> FreshStars:
         """Return the stars of both sets."""
-        return FreshStars(
-            np.concatenate([self.frames, other.frames]),
-            np.concatenate([self.field, other.field]),
-            np.concatenate([self.choices, other.choices + np.array([len(self.field), 0])]),
-            self.pixels,
-            self.points,
+        added_choices = other.choices + np.array([len(self.field), 0])
+        return replace(
+            self,
+            frames=np.concatenate([self.frames, other.frames]),
+            field=np.concatenate([self.field, other.field]),
+            peak=np.concatenate([self.peak, other.peak]),
+            seidel=np.concatenate([self.seidel, other.seidel]),
+            choices=np.concatenate([self.choices, added_choices]),
         )
 
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw stamps (n, P) of sum 1 and the grid indices (n, 2) of their fields."""
+    def draw(self, count: int, rng: np.random.Generator) -> DrawnStars:
+        """Draw stamps at random mirror images and centring errors."""
         star, symmetry = self.choices[rng.integers(len(self.choices), size=count)].T
         jitter = rng.integers(self.pixels.shape[1], size=count)
         stamps = np.take_along_axis(self.frames[star], self.pixels[symmetry, jitter], axis=1)
         stamps /= stamps.sum(axis=1, keepdims=True)
-        field = np.empty(count, int)
+        points = round(len(self.relative_field) ** 0.5)
+        field, peak = np.empty(count, int), np.empty((count, 2), int)
         for g in range(len(self.pixels)):
             is_mirrored = symmetry == g
-            field[is_mirrored] = SYMMETRIES[g].field(self.field[star[is_mirrored]], self.points)
-        return stamps, np.stack(np.divmod(field, self.points)[::-1], axis=1)
+            field[is_mirrored] = SYMMETRIES[g].field(self.field[star[is_mirrored]], points)
+            peak[is_mirrored] = SYMMETRIES[g].pixel(self.peak[star[is_mirrored]])
+        wavefront = np.empty((count, 0))
+        if self.seidel.shape[1]:
+            # Tilts show the image at the middle of the stamp: columns run along x, rows along y.
+            coefficients = monomial_coefficients(self.seidel[star], self.relative_field[field])
+            reach = round((self.pixels.shape[1] ** 0.5 - 1) / 2)
+            offset = peak - np.array(list_jitters(reach))[jitter]
+            coefficients[:, -2:] -= 0.5 * self.pixel * offset[:, ::-1]
+            wavefront = WavefrontCoordinates.encode(coefficients, self.pixel)
+        return DrawnStars(stamps, np.stack(np.divmod(field, points)[::-1], axis=1), wavefront)
 
 
 # The network.
@@ -153,28 +241,22 @@ Matrices = Mapping[str, Sequence[Any]]
 """Matrices of the layers of a network, by kind of layer."""
 
 
-def list_representations(symmetries: Sequence[Symmetry]) -> np.ndarray:
-    """Return the orthonormal functions on a group that are elements of irreducible matrices.
+def list_representations() -> np.ndarray:
+    """Return the orthonormal functions on the symmetries that are elements of irreducible matrices.
 
-    Convolutions on the group are products of their transforms by these functions.
-
-    Parameters
-    ----------
-    symmetries : sequence of Symmetry
-        The identity alone, or all eight symmetries of a square.
+    Convolutions on the group of a square's symmetries are products of their transforms by these
+    functions.
 
     Returns
     -------
     ndarray, shape (G, G)
-        A function in each row: representations of one dimension, then the four elements of the
+        A function in each row: four representations of one dimension, then the four elements of the
         rotations and reflections of the plane, row by row.
     """
-    if len(symmetries) == 1:
-        return np.ones((1, 1))
     # A reflection changes the sign of the determinant; there is a sign for the transposition, too.
-    planes = np.stack([symmetry.matrix for symmetry in symmetries])
+    planes = np.stack([symmetry.matrix for symmetry in SYMMETRIES])
     determinant = np.linalg.det(planes)
-    transposition = np.array([1.0 - 2.0 * symmetry.transpose for symmetry in symmetries])
+    transposition = np.array([1.0 - 2.0 * symmetry.transpose for symmetry in SYMMETRIES])
     scalars = [np.ones(len(planes)), determinant, transposition, determinant * transposition]
     elements = planes.reshape(-1, 4).T * np.sqrt(2.0)
     waves: np.ndarray = np.concatenate([scalars, elements]) / np.sqrt(len(planes))
@@ -185,6 +267,63 @@ def normalise(features: torch.Tensor) -> torch.Tensor:
     """Divide features (G, n, a) by the root of their mean square for each star."""
     square = features.square().mean(dim=(0, 2), keepdim=True)
     return features * torch.rsqrt(square + 1e-6)
+
+
+class Proposals(NamedTuple):
+    """Mixture of K Gaussians of each star's wavefront, in `WavefrontCoordinates`.
+
+    Attributes
+    ----------
+    log_weight : Tensor, shape (n, K)
+        Logarithm of the probability of each Gaussian.
+    mean, log_sd : Tensor, shape (n, K, 8)
+        Coordinates, and the logarithms of their standard deviations, standardised in the network.
+    """
+
+    log_weight: torch.Tensor
+    mean: torch.Tensor
+    log_sd: torch.Tensor
+
+    def log_density(self, wavefront: torch.Tensor) -> torch.Tensor:
+        """Return the log-density (n,) at coordinates (n, 8), without the constant of a Gaussian."""
+        distance = (wavefront[:, None] - self.mean) * torch.exp(-self.log_sd)
+        log_part = self.log_weight - (self.log_sd + 0.5 * distance.square()).sum(dim=2)
+        return torch.logsumexp(log_part, dim=1)
+
+
+class Outputs(NamedTuple):
+    """Results of the network for n stars.
+
+    Attributes
+    ----------
+    psf, log_sigma : Tensor, shape (n, P)
+        Estimates, and the logarithms of their standard deviations.
+    proposals : Proposals or None
+        Wavefronts; None if the network does not propose any.
+    """
+
+    psf: torch.Tensor
+    log_sigma: torch.Tensor
+    proposals: Proposals | None
+
+
+class NetworkEstimate(NamedTuple):
+    """Estimates of n stars.
+
+    Attributes
+    ----------
+    psf, sigma : ndarray, shape (n, d, d), float32
+        PSFs, and the standard deviation of each pixel.
+    wavefront : ndarray, shape (n, K, 8)
+        Proposals in `WavefrontCoordinates`; K = 0 if the network does not propose any.
+    log_weight : ndarray, shape (n, K)
+        Logarithms of their probabilities.
+    """
+
+    psf: np.ndarray
+    sigma: np.ndarray
+    wavefront: np.ndarray
+    log_weight: np.ndarray
 
 
 class PosteriorNetwork(nn.Module):
@@ -198,17 +337,25 @@ class PosteriorNetwork(nn.Module):
         Noise of the images.
     """
 
-    statistics = ("mean", "axes", "variance", "levels", "sigma_scale", "points")
+    statistics = (
+        *("mean", "axes", "variance", "levels", "sigma_scale", "sigma_ratio95", "points"),
+        *("wavefront_mean", "wavefront_sd"),
+    )
     weights = (
         *("input", "input_level", "input_position", "expand", "expand_level", "reduce"),
-        *("output", "output_sigma"),
+        *("output", "output_sigma", "output_wavefront"),
     )
+    proposals = 4
+    """Gaussians of the mixture of wavefronts."""
     mean: torch.Tensor
     axes: torch.Tensor
     variance: torch.Tensor
     levels: torch.Tensor
     sigma_scale: torch.Tensor
+    sigma_ratio95: torch.Tensor
     points: torch.Tensor
+    wavefront_mean: torch.Tensor
+    wavefront_sd: torch.Tensor
     input: nn.Parameter
     input_level: nn.Parameter
     input_position: nn.Parameter
@@ -217,6 +364,7 @@ class PosteriorNetwork(nn.Module):
     reduce: nn.ParameterList
     output: nn.Parameter
     output_sigma: nn.Parameter
+    output_wavefront: nn.Parameter
 
     def __init__(self, arrays: Mapping[str, np.ndarray], noise: NoiseModel) -> None:
         super().__init__()
@@ -231,19 +379,19 @@ class PosteriorNetwork(nn.Module):
             setattr(self, name, parameters)
         # Pixels of the mirror images of a frame of d + 1 pixels, whose middle is the pixel d // 2
         # of the stamp: an image that is mirrored about this pixel stays in the frame.
-        self.symmetries = SYMMETRIES[: arrays["expand"].shape[2]]
         side = round(len(arrays["mean"]) ** 0.5)
         index = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
-        images = [symmetry.image(index)[:side, :side] for symmetry in self.symmetries]
+        images = [symmetry.image(index)[:side, :side] for symmetry in SYMMETRIES]
         self.filters = torch.from_numpy(np.stack([image.ravel() for image in images]))
-        self.waves = torch.from_numpy(list_representations(self.symmetries).astype(np.float32))
+        self.waves = torch.from_numpy(list_representations().astype(np.float32))
+        mirrors = WavefrontCoordinates.mirror()
+        self.wavefront_mirrors = torch.from_numpy(mirrors.astype(np.float32))
 
     @classmethod
     def build(
         cls,
         statistics: Mapping[str, np.ndarray],
         settings: PosteriorNetworkSettings,
-        symmetries: int,
         noise: NoiseModel,
         uses_position: bool,
         rng: np.random.Generator,
@@ -256,8 +404,6 @@ class PosteriorNetwork(nn.Module):
             Arrays of `measure_statistics`.
         settings : PosteriorNetworkSettings
             Sizes of the layers.
-        symmetries : int
-            Number of symmetries, 1 or 8.
         noise : NoiseModel
             Noise of the images.
         uses_position : bool
@@ -265,7 +411,7 @@ class PosteriorNetwork(nn.Module):
         rng : Generator
             Source of the weights.
         """
-        group, pixels = symmetries, (round(len(statistics["mean"]) ** 0.5) + 1) ** 2
+        group, pixels = len(SYMMETRIES), (round(len(statistics["mean"]) ** 0.5) + 1) ** 2
         width, hidden, blocks = settings.width // group, settings.hidden // group, settings.blocks
 
         def draw(*shape: int, inputs: int) -> np.ndarray:
@@ -280,13 +426,11 @@ class PosteriorNetwork(nn.Module):
             "reduce": np.zeros((blocks, width, group, hidden)),
             "output": np.zeros((width, pixels)),
             "output_sigma": np.zeros((width, pixels)),
+            # Small, but different for each Gaussian.
+            "output_wavefront": 0.1
+            * draw(cls.proposals, 1 + 2 * len(statistics["wavefront_mean"]), width, inputs=width),
         }
         return cls({**statistics, **weights}, noise)
-
-    @property
-    def scalars(self) -> int:
-        """Number of representations of one dimension; the others form one of two dimensions."""
-        return min(len(self.symmetries), 4)
 
     def transform_filters(self, weight: torch.Tensor) -> torch.Tensor:
         """Return filters (G, b, P) of stamps, by representation, of filters (b, (d + 1)²)."""
@@ -297,18 +441,16 @@ class PosteriorNetwork(nn.Module):
 
         Returns
         -------
-        scalars : Tensor, shape (1 or 4, a, b)
+        scalars : Tensor, shape (4, a, b)
             Matrices of the representations of one dimension.
         pairs : Tensor, shape (2a, 2b)
-            Matrix of both rows of the representation of two dimensions; empty without it.
+            Matrix of both rows of the representation of two dimensions.
         """
         # A convolution is a product of the transforms; waves are orthonormal, the matrices of a
         # representation are √(G / its dimension) times as large.
         _, group, width = weight.shape
         kernels = torch.einsum("rg,bga->rab", self.waves, weight) * group**0.5
-        scalars, elements = kernels.tensor_split([self.scalars])
-        if not len(elements):
-            return scalars, elements
+        scalars, elements = kernels.split(4)
         # Rows are features (l, a), columns (j, b), of the matrix element (j, l).
         pairs = (elements / 2**0.5).unflatten(0, (2, 2)).permute(1, 2, 0, 3)
         return scalars, pairs.reshape(2 * width, -1)
@@ -317,12 +459,10 @@ class PosteriorNetwork(nn.Module):
         self, features: torch.Tensor, matrices: tuple[torch.Tensor, torch.Tensor]
     ) -> torch.Tensor:
         """Map features (G, n, a), by representation, to features (G, n, b)."""
-        n, stars = self.scalars, features.shape[1]
-        scalars = features[:n] @ matrices[0]
-        if len(features) == n:
-            return scalars
+        stars = features.shape[1]
+        scalars = features[:4] @ matrices[0]
         # Features (i, j) of both rows i of the matrices have the same weights.
-        rows = features[n:].unflatten(0, (2, 2)).transpose(1, 2).reshape(2 * stars, -1)
+        rows = features[4:].unflatten(0, (2, 2)).transpose(1, 2).reshape(2 * stars, -1)
         pairs = (rows @ matrices[1]).view(2, stars, 2, -1).transpose(1, 2).flatten(0, 1)
         return torch.cat([scalars, pairs])
 
@@ -350,7 +490,7 @@ class PosteriorNetwork(nn.Module):
     def encode_position(self, position: torch.Tensor) -> torch.Tensor:
         """Return polynomials (n, G, 9) of the mirrored grid indices (n, 2)."""
         middle = torch.clamp((self.points - 1) / 2, min=0.5)
-        matrices = torch.from_numpy(np.stack([s.matrix for s in self.symmetries]))
+        matrices = torch.from_numpy(np.stack([s.matrix for s in SYMMETRIES]))
         # The feature of a symmetry g has the position that g moves to the position of the star.
         x, y = torch.einsum("nj,gji->ign", position / middle - 1.0, matrices.to(position))
         terms = [x**i * y ** (order - i) for order in (1, 2, 3) for i in range(order + 1)]
@@ -362,8 +502,8 @@ class PosteriorNetwork(nn.Module):
         level: torch.Tensor,
         position: torch.Tensor | None,
         matrices: Matrices | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Map noisy images (n, P) of levels (n,) to estimates and the logarithm of their σ.
+    ) -> Outputs:
+        """Map noisy images (n, P) of levels (n,) to estimates.
 
         Parameters
         ----------
@@ -376,7 +516,7 @@ class PosteriorNetwork(nn.Module):
         matrices : mapping, optional
             Result of `matrices`.
         """
-        matrices, group = matrices or self.matrices(), len(self.symmetries)
+        matrices, group = matrices or self.matrices(), len(SYMMETRIES)
         # The linear estimate and its standard deviation; noise of the mean star's photons included.
         photons = self.noise.kappa / np.sqrt(self.noise.background) / noisy.shape[1]
         noise = ((self.noise.kappa * level) ** 2 + photons * level)[:, None]
@@ -402,12 +542,37 @@ class PosteriorNetwork(nn.Module):
                 mirrored = functional.gelu(mirrored + functional.linear(levels, of_level))
                 inner = (self.waves @ mirrored.flatten(1)).view_as(inner)
                 features = features + self.convolve(inner, reduce)
-            features = normalise(features).transpose(0, 1).flatten(1)
-            outputs = features @ matrices["output"][0]
+            features = normalise(features)
+            outputs = features.transpose(0, 1).flatten(1) @ matrices["output"][0]
         correction, log_ratio = outputs.float().chunk(2, dim=1)
-        estimate = self.mean + (linear + spread * correction) @ self.axes.T
         # σ of a pixel is a multiple of the RMS error of the linear estimate.
-        return estimate, log_ratio + 0.5 * spread.square().mean(dim=1, keepdim=True).log()
+        log_scale = 0.5 * spread.square().mean(dim=1, keepdim=True).log()
+        return Outputs(
+            self.mean + (linear + spread * correction) @ self.axes.T,
+            log_ratio + log_scale,
+            self.propose(features) if len(self.wavefront_mean) else None,
+        )
+
+    def propose(self, features: torch.Tensor) -> Proposals:
+        """Return wavefronts of features (G, n, width) by representation, in single precision.
+
+        The feature of a symmetry g has seen the star that g moves to the image.
+        """
+        with torch.autocast("cpu", enabled=False):
+            views = torch.einsum("rg,rnw->gnw", self.waves, features.float())
+            values = torch.einsum("gnw,kvw->gnkv", views, self.output_wavefront)
+            return self.average_proposals(values)
+
+    def average_proposals(self, values: torch.Tensor) -> Proposals:
+        """Return the means over the symmetries of proposals (G, n, K, 17), each as it has seen."""
+        logits, mean, log_sd = values.split([1, *[WavefrontCoordinates.size] * 2], dim=3)
+        # Wavefronts are moved as the stars that the symmetries have seen.
+        group = len(SYMMETRIES)
+        return Proposals(
+            logits.mean(dim=0).squeeze(2).log_softmax(dim=1),
+            torch.einsum("gab,gnkb->nka", self.wavefront_mirrors, mean) / group,
+            torch.einsum("gab,gnkb->nka", self.wavefront_mirrors.abs(), log_sd) / group,
+        )
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the statistics and the weights by name."""
@@ -423,20 +588,30 @@ class PosteriorNetwork(nn.Module):
     @torch.inference_mode()
     def estimate(
         self, noisy: np.ndarray, level: np.ndarray, position: np.ndarray | None, batch: int = 256
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return PSFs and their calibrated σ, both (n, d, d), float32, of images (n, d, d)."""
-        psf, sigma = (np.empty(noisy.shape, np.float32) for _ in range(2))
-        matrices = self.matrices()
-        scale = np.interp(np.log(level), np.log(self.levels.numpy()), self.sigma_scale.numpy())
+    ) -> NetworkEstimate:
+        """Return estimates of images (n, d, d) of levels (n,), with calibrated σ."""
+        matrices, parts = self.matrices(), []
         for start in range(0, len(noisy), batch):
             part = slice(start, start + batch)
             inputs = [noisy[part].reshape(len(noisy[part]), -1), level[part]]
             inputs += [] if position is None else [position[part]]
             tensors = [torch.from_numpy(np.asarray(values, np.float32)) for values in inputs]
-            mean, log_sigma = self(*tensors, *[None] * (3 - len(tensors)), matrices)
-            psf[part] = mean.numpy().reshape(psf[part].shape)
-            sigma[part] = log_sigma.exp().numpy().reshape(psf[part].shape)
-        return psf, sigma * scale[:, None, None].astype(np.float32)
+            parts.append(self(*tensors, *[None] * (3 - len(tensors)), matrices))
+        psf, log_sigma = (
+            torch.cat([getattr(part, name) for part in parts]).numpy().reshape(noisy.shape)
+            for name in ("psf", "log_sigma")
+        )
+        scale = np.interp(np.log(level), np.log(self.levels.numpy()), self.sigma_scale.numpy())
+        sigma = np.exp(log_sigma) * scale[:, None, None].astype(np.float32)
+        if not len(self.wavefront_mean):
+            none = np.empty((len(noisy), 0))
+            return NetworkEstimate(psf, sigma, none.reshape(len(noisy), 0, 8), none)
+        proposals = [part.proposals for part in parts if part.proposals]
+        # Within the range of wavefronts that can be propagated.
+        scaled_mean = torch.cat([p.mean for p in proposals]).clamp(-4.0, 4.0)
+        mean = scaled_mean * self.wavefront_sd + self.wavefront_mean
+        log_weight = torch.cat([p.log_weight for p in proposals])
+        return NetworkEstimate(psf, sigma, mean.double().numpy(), log_weight.double().numpy())
 
 
 def number_fields(position: np.ndarray, points: int) -> np.ndarray:
@@ -445,23 +620,27 @@ def number_fields(position: np.ndarray, points: int) -> np.ndarray:
     return fields
 
 
-def measure_statistics(
-    stamps: np.ndarray, levels: np.ndarray, points: int
-) -> dict[str, np.ndarray]:
+def measure_statistics(stars: DrawnStars, levels: np.ndarray, points: int) -> dict[str, np.ndarray]:
     """Return the buffers of a network: mean, eigenvectors and variances of stamps; and others.
 
     Parameters
     ----------
-    stamps : ndarray, shape (n, P)
-        Noise-free stamps.
+    stars : DrawnStars
+        Noise-free stars.
     levels : ndarray, shape (L,)
         Noise levels of the training.
     points : int
         Field points along a side.
     """
-    mean = stamps.mean(axis=0, dtype=np.float64)
-    deviation = stamps - mean
-    variance, axes = np.linalg.eigh(deviation.T @ deviation / len(stamps))
+    mean = stars.stamps.mean(axis=0, dtype=np.float64)
+    deviation = stars.stamps - mean
+    variance, axes = np.linalg.eigh(deviation.T @ deviation / len(deviation))
+    # By symmetry, only spherical aberration and focus have a mean, and x and y the same scatter.
+    wavefront_mean, wavefront_sd = stars.wavefront.mean(axis=0), np.std(stars.wavefront, axis=0)
+    if len(wavefront_sd):
+        wavefront_mean[[1, 2, 4, 5, 6, 7]] = 0.0
+        for pair in ([1, 2], [6, 7]):
+            wavefront_sd[pair] = np.sqrt(np.square(wavefront_sd[pair]).mean())
     return {
         "mean": mean,
         "axes": axes,
@@ -469,7 +648,10 @@ def measure_statistics(
         "variance": np.maximum(variance, 1e-16),
         "levels": np.sort(levels),
         "sigma_scale": np.ones(len(levels)),
+        "sigma_ratio95": np.full(len(levels), 1.96),
         "points": np.array([points]),
+        "wavefront_mean": wavefront_mean,
+        "wavefront_sd": wavefront_sd,
     }
 
 
@@ -486,6 +668,8 @@ class PosteriorNetworkTraining(Training):
         Sizes of the network and course of the training.
     uses_position : bool
         Whether the position in the field is an input.
+    proposes_wavefronts : bool
+        Whether the network proposes wavefronts, too; its PSFs then need longer trainings.
     attempt : int
         Not used: these networks do not die.
     """
@@ -496,6 +680,7 @@ class PosteriorNetworkTraining(Training):
     grad_clip = 1.0
     half_precision_start = 0.0
     sigma_weight = 0.1
+    wavefront_weight = 0.03
 
     def __init__(
         self,
@@ -503,6 +688,7 @@ class PosteriorNetworkTraining(Training):
         config: Config,
         settings: PosteriorNetworkSettings,
         uses_position: bool,
+        proposes_wavefronts: bool = False,
         attempt: int = 0,
     ) -> None:
         self.data, self.config = data, config
@@ -510,11 +696,12 @@ class PosteriorNetworkTraining(Training):
         self.fields[number_fields(data.positions[data.train], config.grid.points)] = True
         # Statistics of the first stars, and random weights.
         self.stars = FreshStars.simulate(config, 0, settings.stars, self.fields)
-        stamps, _ = self.stars.draw(20_000, self.stream("statistics"))
-        symmetries, points = len(list_symmetries(config)), config.grid.points
+        stamp_draws = self.stars.draw(20_000, self.stream("statistics"))
+        if not proposes_wavefronts:
+            stamp_draws = stamp_draws._replace(wavefront=stamp_draws.wavefront[:, :0])
         model = PosteriorNetwork.build(
-            measure_statistics(stamps, data.levels, points),
-            *(settings, symmetries, data.noise, uses_position, self.stream("init")),
+            measure_statistics(stamp_draws, data.levels, config.grid.points),
+            *(settings, data.noise, uses_position, self.stream("init")),
         )
         # Mean squared error at each noise level, over the latest steps.
         self.level_errors = [float("nan")] * len(data.levels)
@@ -526,44 +713,40 @@ class PosteriorNetworkTraining(Training):
         return stream(self.data.seed, "posterior network", *names)
 
     def begin(self, lr: float) -> torch.optim.Optimizer:
-        """Return the optimiser: Muon for the kernels between hidden features, else Adam.
-
-        Without symmetries, the kernels are large matrices, of which Muon's iteration takes several
-        times as long as the rest of a step.
-        """
-        if len(self.model.symmetries) == 1:
-            return Adam(self.model.parameters(), lr=lr, fused=True)
+        """Return the optimiser: Muon for the kernels between hidden features, else Adam."""
         inner = [*self.model.expand, *self.model.reduce]
         others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
         groups: list[dict[str, Any]] = [{"params": others}, {"params": inner, "orthogonal": True}]
         return Muon(groups, lr=lr, fused=True)
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Yield stamps, noisy images, their levels' numbers and their positions."""
+        """Yield stamps, noisy images, their levels' numbers, positions and wavefronts."""
         # One further set of stars for each epoch; a training that resumes simulates all of them.
-        while self.sets <= epoch and len(self.model.symmetries) > 1:
+        while self.sets <= epoch:
             new = FreshStars.simulate(self.config, self.sets, self.settings.stars, self.fields)
             self.stars, self.sets = self.stars.add(new), self.sets + 1
         rng, levels = self.stream("epoch", epoch), self.data.levels
         for _ in range(self.steps):
-            stamps, position = self.stars.draw(self.settings.batch, rng)
+            stamps, position, wavefront = self.stars.draw(self.settings.batch, rng)
             number = rng.integers(len(levels), size=len(stamps))
             # Laws with correlated pixels need images.
             images = stamps.reshape(-1, *self.data.images.shape[1:])
             noisy = self.data.noise.draw_gaussian(images, levels[number], rng)
-            arrays = (stamps, noisy.reshape(stamps.shape), number, position.astype(np.float32))
+            noisy, places = noisy.reshape(stamps.shape), (position, wavefront)
+            arrays = (stamps, noisy, number, *(values.astype(np.float32) for values in places))
             yield tuple(map(torch.from_numpy, arrays))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the mean over stars of the squared error over the latest errors of its level.
 
         All noise levels have the same weight in this way. The logarithm of the probability of the
-        errors by a normal distribution of the network's σ is added.
+        errors by a normal distribution of the network's σ is added, and of the wavefront by the
+        mixture of proposals.
         """
-        stamps, noisy, number, position = batch
+        stamps, noisy, number, position, wavefront = batch
         level = torch.from_numpy(self.data.levels.astype(np.float32))[number]
-        estimate, log_sigma = self.model(noisy, level, position)
-        square = (estimate - stamps) ** 2
+        psf, log_sigma, proposals = self.model(noisy, level, position)
+        square = (psf - stamps) ** 2
         errors = square.mean(dim=1)
         for n, latest in enumerate(self.level_errors):
             is_level = number == n
@@ -573,6 +756,9 @@ class PosteriorNetworkTraining(Training):
         weight = 1.0 / torch.tensor(self.level_errors)[number]
         improbability = log_sigma + 0.5 * square.detach() * torch.exp(-2.0 * log_sigma)
         loss: torch.Tensor = (weight * errors).mean() + self.sigma_weight * improbability.mean()
+        if proposals is not None:
+            scaled_wavefront = (wavefront - self.model.wavefront_mean) / self.model.wavefront_sd
+            loss = loss - self.wavefront_weight * proposals.log_density(scaled_wavefront).mean()
         return loss
 
     def validate(self, epoch: int) -> float:
@@ -581,30 +767,45 @@ class PosteriorNetworkTraining(Training):
 
     def measure_validation(self) -> Iterator[float]:
         """Yield the MSE of the validation stars at each level, with the same noise every time."""
-        for truth, psf, _ in self.restore_validation():
-            yield float(np.square(psf - truth).mean(dtype=np.float64))
-
-    def restore_validation(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield truth, PSF and σ of the validation stars at each noise level."""
         stars = self.data.validation
         truth, rng = self.data.images[stars], self.stream("validation")
         for level in np.sort(self.data.levels):
             noisy = self.data.noise.draw(truth, level, rng)
-            yield (
-                truth,
-                *self.model.estimate(noisy, np.full(len(stars), level), self.data.positions[stars]),
-            )
+            levels = np.full(len(stars), level)
+            psf = self.model.estimate(noisy, levels, self.data.positions[stars]).psf
+            yield float(np.square(psf - truth).mean(dtype=np.float64))
 
     def finish(self) -> PosteriorNetwork:
         """Return the network with the best weights, and with calibrated standard deviations."""
         self.model.load_state_dict(self.result)
-        self.model.sigma_scale[:] = torch.from_numpy(self.calibrate_sigma())
+        scale68, scale95 = self.calibrate_sigma()
+        self.model.sigma_scale[:] = torch.from_numpy(scale68)
+        self.model.sigma_ratio95[:] = torch.from_numpy(scale95 / scale68)
         return self.model
 
+    def draw_fresh_stars(self) -> DrawnStars:
+        """Draw stamps of stars that the training has not used.
+
+        As many stars as of an epoch are simulated, and each is drawn twice on average.
+        """
+        count = self.settings.stars
+        fresh = FreshStars.simulate(self.config, "calibration", count, self.fields)
+        return fresh.draw(2 * count, self.stream("calibration"))
+
     def calibrate_sigma(self) -> np.ndarray:
-        """Return the factor of σ at each level by which it holds 68 % of the validation errors."""
-        ratios = [np.abs(psf - truth) / sigma for truth, psf, sigma in self.restore_validation()]
-        return np.array([np.quantile(ratio, 0.682689) for ratio in ratios])
+        """Return the factors (2, L) of σ by which it holds 68 % and 95 % of the errors of stars.
+
+        The errors of a posterior of several wavefronts are not normal.
+        """
+        stars = self.draw_fresh_stars()
+        truth = stars.stamps.reshape(-1, *self.data.images.shape[1:])
+        scales, rng = [], self.stream("calibration", "noise")
+        for level in np.sort(self.data.levels):
+            noisy = self.data.noise.draw(truth, level, rng)
+            estimate = self.model.estimate(noisy, np.full(len(truth), level), stars.position)
+            ratio = np.abs(estimate.psf - truth) / estimate.sigma
+            scales.append(np.quantile(ratio, [0.682689, 0.95]))
+        return np.array(scales).T
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
         """Return a row of the history."""

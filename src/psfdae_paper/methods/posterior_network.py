@@ -28,7 +28,7 @@ from psfdae.stars.noise import build_noise
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
 
 if TYPE_CHECKING:
-    from psfdae_paper.bounds.posterior_network import PosteriorNetwork
+    from psfdae_paper.bounds.posterior_network import PosteriorNetwork, PosteriorNetworkTraining
 
 
 class PosteriorNetworkMethod(Method):
@@ -51,7 +51,13 @@ class PosteriorNetworkMethod(Method):
             "variance": ("1", "its eigenvalues"),
             "levels": ("1", "noise levels of the training"),
             "sigma_scale": ("1", "factor of the standard deviations at each level"),
+            "sigma_ratio95": (
+                "1",
+                "standard deviations that hold 95 % of the errors, at each level",
+            ),
             "points": ("1", "field points along a side"),
+            "wavefront_mean": ("waves", "mean of the coordinates of wavefronts"),
+            "wavefront_sd": ("waves", "their standard deviations"),
             "input": ("1", "filters of the first layer"),
             "input_level": ("1", "weights of the noise level in the first layer"),
             "input_position": ("1", "weights of the position in the first layer"),
@@ -60,12 +66,14 @@ class PosteriorNetworkMethod(Method):
             "reduce": ("1", "weights of the second layer of each block"),
             "output": ("1", "filters of the PSF"),
             "output_sigma": ("1", "filters of the logarithm of the standard deviation"),
+            "output_wavefront": ("1", "weights of the proposals of wavefronts"),
         },
         diagnostics=(HISTORY,),
         per_reference=True,
     )
     packing = None
     groups: ClassVar = {"posterior_network": PosteriorNetworkSettings}
+    proposes_wavefronts: ClassVar[bool] = False
 
     def __init__(
         self, network: PosteriorNetwork, history: list[dict[str, Any]] | None = None
@@ -75,12 +83,21 @@ class PosteriorNetworkMethod(Method):
 
     @classmethod
     def fit(cls, data: TrainingSet, posterior_network: PosteriorNetworkSettings) -> Self:
-        """Train on stars of the simulation that made the training stars.
+        """Train on stars of the simulation that made the training stars; raises as `train`."""
+        training = cls.train(data, posterior_network)
+        return cls(training.finish(), training.history)
+
+    @classmethod
+    def train(
+        cls, data: TrainingSet, posterior_network: PosteriorNetworkSettings
+    ) -> PosteriorNetworkTraining:
+        """Run the training of the network.
 
         Raises
         ------
         FitError
-            If the stars are not simulated, or the reference is their template.
+            If the stars are not simulated with random aberrations, or the reference is their
+            template.
         """
         import torch
 
@@ -88,12 +105,18 @@ class PosteriorNetworkMethod(Method):
         from psfdae_paper.bounds.posterior_network import PosteriorNetworkTraining
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
+        from psfdae_paper.configuration.wavefront import VonKarman
 
         if not data.simulation:
             raise FitError(f"{cls.name}: needs stars of a simulation, these come from an image")
         if data.reference != "realisation":
             raise FitError(f"{cls.name}: restores noise-free stars, not reference={data.reference}")
         config = part(SIMULATION, data.simulation)
+        if isinstance(config.wavefront, VonKarman):
+            raise FitError(
+                f"{cls.name}: needs stars with random aberrations; method static_posterior knows"
+                " the static PSFs of turbulence"
+            )
         torch.set_num_threads(posterior_network.threads)
         # Everything that determines the result.
         decisions = {
@@ -105,12 +128,11 @@ class PosteriorNetworkMethod(Method):
         digest = loop.fingerprint(decisions, data.images, data.validation, data.positions)
         with loop.progress(posterior_network.epochs) as report:
             assert data.checkpoint is not None
-            begin = partial(
-                PosteriorNetworkTraining, data, config, posterior_network, cls.needs.position
-            )
+            kind = cls.needs.position, cls.proposes_wavefronts
+            begin = partial(PosteriorNetworkTraining, data, config, posterior_network, *kind)
             training = loop.train(begin, data.checkpoint, digest, report)
         assert isinstance(training, PosteriorNetworkTraining)
-        return cls(training.finish(), training.history)
+        return training
 
     def estimate(
         self,
@@ -122,7 +144,18 @@ class PosteriorNetworkMethod(Method):
         """Return PSFs of sum 1 and the standard deviation of each pixel."""
         levels = np.broadcast_to(np.asarray(level, np.float64), len(noisy))
         place = position if self.needs.position else None
-        return Estimate(*self.network.estimate(noisy, levels, place))
+        estimate = self.network.estimate(noisy, levels, place)
+        return Estimate(estimate.psf, estimate.sigma)
+
+    @property
+    def calibration(self) -> tuple[np.ndarray, np.ndarray]:
+        """Noise levels (L,), and the number of standard deviations for 95 % of the errors, (L,)."""
+        return self.network.levels.numpy(), self.network.sigma_ratio95.numpy()
+
+    def facts(self) -> Mapping[str, str]:
+        """Return the half-widths of intervals that contain 95 % of the errors of fresh stars."""
+        widths = zip(*self.calibration, strict=True)
+        return {"95 % of the errors": ", ".join(f"{w:.2f} σ at λ = {v:g}" for v, w in widths)}
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the statistics and the weights of the network."""

@@ -11,16 +11,19 @@ import torch
 
 from costs import load_points
 from psfdae.base.files import read_product
-from psfdae.base.settings import parse_settings
+from psfdae.base.settings import ConfigError, parse_settings
 from psfdae.methods import method
 from psfdae.methods.interface import FitError
 from psfdae.methods.networks.training import Training
+from psfdae.optics.derivatives import PointSampling, SampledStamps
+from psfdae.optics.wavefronts import monomial_images
 from psfdae.stars.noise import CorrelatedNoise, GaussianNoise, NoiseModel
 from psfdae.training.star_sets import training_set
-from psfdae_paper.bounds.estimates import propagate_static_psfs
 from psfdae_paper.bounds.posterior_network import (
+    DrawnStars,
     FreshStars,
     PosteriorNetwork,
+    WavefrontCoordinates,
     list_representations,
     measure_statistics,
 )
@@ -42,11 +45,13 @@ WORDS = (
 WORDS += ("parts.train_stars=60", "parts.test_stars=30")
 
 
-def build(stamps, symmetries=8, uses_position=False):
-    statistics = measure_statistics(stamps.reshape(len(stamps), -1), LEVELS, points=11)
+def build(stamps, uses_position=False, wavefront=None):
+    wavefront = np.empty((len(stamps), 0)) if wavefront is None else wavefront
+    stars = DrawnStars(stamps.reshape(len(stamps), -1), np.zeros((len(stamps), 2)), wavefront)
+    statistics = measure_statistics(stars, LEVELS, points=11)
     settings = parse_settings(PosteriorNetworkSettings, SIZES)
     rng = np.random.default_rng(0)
-    return PosteriorNetwork.build(statistics, settings, symmetries, NOISE, uses_position, rng)
+    return PosteriorNetwork.build(statistics, settings, NOISE, uses_position, rng)
 
 
 def randomise(network):
@@ -74,7 +79,7 @@ def test_new_network_is_the_posterior_mean_of_one_gaussian_mode():
     amplitudes = tau * (amplitudes - amplitudes.mean()) / amplitudes.std()
     stamps = 1 / side**2 + amplitudes[:, None, None] * mode
     noisy = NOISE.draw(stamps, 1e-3, rng)
-    psf, _ = build(stamps).estimate(noisy, np.full(400, 1e-3), None)
+    psf = build(stamps).estimate(noisy, np.full(400, 1e-3), None).psf
     variance = NOISE.variance(np.array(1 / side**2), 1e-3)
     projection = ((noisy - 1 / side**2) * mode).sum(axis=(1, 2), keepdims=True)
     expected = 1 / side**2 + tau**2 / (tau**2 + variance) * projection * mode
@@ -84,13 +89,12 @@ def test_new_network_is_the_posterior_mean_of_one_gaussian_mode():
     assert error == pytest.approx(tau**2 * variance / (tau**2 + variance), rel=0.2)
 
 
-@pytest.mark.parametrize("symmetries", [1, 8])
-def test_estimates_have_the_sum_1(symmetries):
+def test_estimates_have_the_sum_1():
     rng = np.random.default_rng(4)
     stamps = rng.random((300, 8, 8))
     stamps /= stamps.sum(axis=(1, 2), keepdims=True)
-    network = randomise(build(stamps, symmetries))
-    psf, sigma = network.estimate(NOISE.draw(stamps, 5e-3, rng), np.full(300, 5e-3), None)
+    network = randomise(build(stamps))
+    psf, sigma, *_ = network.estimate(NOISE.draw(stamps, 5e-3, rng), np.full(300, 5e-3), None)
     assert psf.std(axis=0).min() > 1e-4
     assert psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
     assert (sigma > 0).all()
@@ -103,21 +107,28 @@ def test_network_commutes_with_mirror_images(monkeypatch):
     stamps[:, 1:, 1:] = rng.random((200, 7, 7))
     stamps /= stamps.sum(axis=(1, 2), keepdims=True)
     every = np.concatenate([mirror(stamps, symmetry) for symmetry in SYMMETRIES])
-    network = randomise(build(every, uses_position=True))
+    matrices = WavefrontCoordinates.mirror()
+    wavefronts = rng.standard_normal((200, 8)) @ matrices
+    network = randomise(build(every, uses_position=True, wavefront=wavefronts.reshape(-1, 8)))
     position = rng.integers(0, 11, (6, 2))
-    psf, sigma = network.estimate(stamps[:6], level, position)
+    psf, sigma, wavefront, log_weight = network.estimate(stamps[:6], level, position)
     assert np.abs(psf - psf[0]).max() > 1e-3
-    for symmetry in SYMMETRIES:
+    assert np.abs(wavefront - wavefront[0]).max() > 0.1
+    mean = network.wavefront_mean.numpy()
+    for symmetry, matrix in zip(SYMMETRIES, matrices, strict=True):
         fields = symmetry.field(position @ [1, 11], 11)
         place = np.stack(np.divmod(fields, 11)[::-1], axis=1)
-        moved, moved_sigma = network.estimate(mirror(stamps[:6], symmetry), level, place)
+        moved, moved_sigma, *modes = network.estimate(mirror(stamps[:6], symmetry), level, place)
         assert moved == pytest.approx(mirror(psf, symmetry), abs=2e-6)
         inner = mirror(sigma, symmetry)[:, 1:, 1:]
         assert moved_sigma[:, 1:, 1:] == pytest.approx(inner, rel=1e-4)
+        # Wavefronts move with the star, their probabilities do not change.
+        assert modes[0] - mean == pytest.approx((wavefront - mean) @ matrix.T, abs=1e-5)
+        assert modes[1] == pytest.approx(log_weight, abs=1e-5)
 
 
 def test_representations_are_orthonormal():
-    waves = list_representations(SYMMETRIES)
+    waves = list_representations()
     assert waves @ waves.T == pytest.approx(np.eye(8), abs=1e-12)
 
 
@@ -135,31 +146,22 @@ def test_drawn_stamps_are_framed_in_the_fields_that_are_asked_for(product):
     """The brightest pixel, or one that is as bright, is within the centring error of the middle."""
     config = load_stage(SIMULATION, WORDS)
     fields = np.arange(9) % 2 == 0
-    stamps, position = FreshStars.simulate(config, 1, 27, fields).draw(
-        400, np.random.default_rng(6)
-    )
+    stars = FreshStars.simulate(config, 1, 27, fields)
+    stamps, position, wavefront = stars.draw(400, np.random.default_rng(6))
     assert stamps.sum(axis=1) == pytest.approx(1.0, abs=1e-5)
     assert set(position @ [1, 3]) == {0, 2, 4, 6, 8}
     images = stamps.reshape(-1, 16, 16)
     middle = images[:, 7:10, 7:10].max(axis=(1, 2))
     assert middle == pytest.approx(images.max(axis=(1, 2)), rel=1e-3)
+    # Each stamp is the image of its wavefront.
+    coefficients = WavefrontCoordinates.decode(wavefront, config.telescope.pixel)
+    optics = SampledStamps(0.3, monomial_images, PointSampling, 16, stars.pixel, "complex64", [318])
+    propagated = optics.stamps(coefficients)
+    propagated /= propagated.sum(axis=(1, 2), keepdims=True)
+    assert np.square(propagated - images).mean() < 1e-9
     # All centring errors occur.
     pixels = images[:, 7:10, 7:10].reshape(-1, 9).argmax(axis=1)
     assert np.bincount(pixels, minlength=9).min() > 20
-
-
-def test_drawn_stamps_of_turbulence_are_the_static_psfs_of_their_fields():
-    words = ("dataset=dataset8", "preset=smoke", "grid.points=2", "wavefront.waves=64")
-    config, fields = load_stage(SIMULATION, words), np.array([True, True, False, True])
-    stamps, position = FreshStars.simulate(config, 0, 10, fields).draw(60, np.random.default_rng(8))
-    number = position @ [1, 2]
-    assert set(number) == {0, 1, 3}
-    static = propagate_static_psfs(config).reshape(4, 9, -1)
-    distance = np.abs(stamps[:, None] - static[number]).max(axis=2)
-    assert distance.min(axis=1) == pytest.approx(0.0, abs=1e-6)
-    # Every centring error occurs, and other fields have other PSFs.
-    assert set(distance.argmin(axis=1)) == set(range(9))
-    assert np.abs(stamps[:, None] - static[number - 1]).max(axis=2).min() > 1e-3
 
 
 @pytest.mark.parametrize("name", ["posterior_network", "posterior_network_position"])
@@ -190,11 +192,42 @@ def test_training_lowers_the_error_and_calibrates_sigma(product, name, tmp_path)
     assert np.array_equal(estimate.psf, loaded.estimate(noisy, level, data.positions).psf)
     coverage = (np.abs(estimate.psf - data.images) < estimate.sigma).mean()
     assert coverage == pytest.approx(0.68, abs=0.06)
+    levels, ratio95 = fitted.calibration
+    assert levels[-1] == pytest.approx(level[0]) and "σ at λ = 0.003" in str(fitted.facts())
+    wide = (np.abs(estimate.psf - data.images) < ratio95[-1] * estimate.sigma).mean()
+    assert wide == pytest.approx(0.95, abs=0.03)
     # The same seed gives the same network.
     short = settings.model_copy(update={"epochs": 1, "steps": 5})
     once, again = (kind.fit(data, short).estimate(noisy, level, data.positions) for _ in range(2))
     assert np.array_equal(once.psf, again.psf)
     assert np.array_equal(once.sigma, again.sigma)
+
+
+def test_refined_network_is_saved_with_its_optics(product, tmp_path):
+    """At little noise the optics count more than a network of a few steps."""
+    kind, plain = method("posterior_network_refined"), method("posterior_network")
+    words = (*WORDS, "noise.levels=[0.0003,0.001]", "posterior_network.stars=40")
+    words += ("posterior_network.steps=60", "posterior_network.lr=0.006")
+    config = load_stage(("seed", "noise", "parts", "posterior_network"), words)
+    data = training_set(config, kind, product, "random", "realisation", checkpoint=tmp_path / "c")
+    fitted = kind.fit(data, **kind.settings(config))
+    rng, level = np.random.default_rng(9), np.full(30, 1e-3)
+    truth = data.images[:30]
+    noisy = data.noise.draw(truth, 1e-3, rng)
+    estimate = fitted.estimate(noisy, level)
+    assert estimate.psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-4)
+    network = plain(fitted.network).estimate(noisy, level)
+    assert np.square(estimate.psf - truth).mean() < np.square(network.psf - truth).mean()
+    fitted.save(tmp_path / "fit.h5", config.model_dump())
+    loaded = kind.load(tmp_path / "fit.h5").estimate(noisy, level)
+    assert loaded.psf == pytest.approx(estimate.psf, abs=1e-7)
+    assert loaded.sigma == pytest.approx(estimate.sigma, rel=1e-4)
+    # Stars of turbulence, or with other noise than photons', have no such optics.
+    turbulence = {**data.simulation, "scene": {"name": "turbulence"}}
+    with pytest.raises(FitError, match="random Seidel aberrations"):
+        kind.fit(replace(data, simulation=turbulence), **kind.settings(config))
+    with pytest.raises(ConfigError, match="posterior_network_refined"):
+        load(["dataset=dataset3", "noise.law=gaussian", f"methods=[{kind.name}]"])
 
 
 @pytest.mark.parametrize("law", [GaussianNoise, partial(CorrelatedNoise, shift_px=0.5)])
@@ -226,12 +259,16 @@ def test_stars_of_an_image_and_templates_are_rejected(product, tmp_path):
     data = training_set(config, kind, product, "random", "realisation")
     with pytest.raises(FitError, match="needs stars of a simulation"):
         kind.fit(replace(data, simulation={}), **kind.settings(config))
+    static = load_stage(SIMULATION, ("dataset=dataset8",)).model_dump()
+    with pytest.raises(FitError, match="method static_posterior"):
+        kind.fit(replace(data, simulation=static), **kind.settings(config))
     with pytest.raises(FitError, match="reference=template"):
         kind.fit(replace(data, reference="template"), **kind.settings(config))
 
 
 def test_networks_are_timed_only_on_request():
     points, config = load_points(), load(["dataset=dataset3"])
-    assert points.networks == ["posterior_network", "posterior_network_position"]
+    kinds = ("", "_position", "_refined")
+    assert points.networks == [f"posterior_network{kind}" for kind in kinds]
     assert set(points.networks).isdisjoint({*points.further_methods, *config.methods})
     assert "configured" in points.overrides("dataset3", "posterior_network")

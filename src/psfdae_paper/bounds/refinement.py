@@ -1,0 +1,515 @@
+"""Wavefronts that are refined by the optics, from the proposals of a network.
+
+The stamp p(c) of a star depends on the coefficients c of eight pupil monomials, with tilts that
+show the image at its place in the stamp. About an expansion point c⁰ the likelihood of the photons
+is a Gaussian of δ = c − c⁰,
+
+    ln L(c⁰ + δ) ≈ ln L(c⁰) + gᵀδ − ½ δᵀMδ,
+
+with the score g and the Fisher information M. The prior is a sum over fields f and offsets o of the
+stamp in whole pixels. In each of them, c is linear in the standardised Seidel coefficients,
+c = s_fo + D_fᵀ z with z ~ N(0, 1). Product and integral are Gaussians: with e = s_fo − c⁰,
+
+    A = D M Dᵀ + 1,   b = D (g − M e),   ⟨z⟩ = A⁻¹ b,   cov z = A⁻¹,
+    ln mass = gᵀe − ½ eᵀMe + ½ bᵀA⁻¹b − ½ ln |A|.
+
+The expansion point moves to the most likely of these, and the stamp is computed anew. In the end
+the sums over all fields and offsets give the posterior mean ⟨p⟩ ≈ p + ⟨δ⟩ᵀ∂p and its variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
+from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
+from psfdae.sensing.climbing import poisson_information
+from psfdae.stars.noise import NoiseModel
+from psfdae_paper.bounds.posterior_network import PosteriorNetwork, WavefrontCoordinates
+
+
+@dataclass(frozen=True)
+class SeidelPrior:
+    """Prior of the wavefronts of stars in all fields and at all offsets of their stamps.
+
+    Attributes
+    ----------
+    mean, sd : ndarray, shape (5,)
+        Mean and standard deviation of the Seidel coefficients in waves.
+    field : ndarray, shape (F, 2)
+        Field vectors, equally likely; 1 at the edge on an axis.
+    pixel : float
+        Width of a pixel in λ/D.
+    max_abs_z : float
+        Maximum of |z| to which a step leads.
+    """
+
+    mean: np.ndarray
+    sd: np.ndarray
+    field: np.ndarray
+    pixel: float
+    max_abs_z: ClassVar[float] = 6.0
+
+    @cached_property
+    def static(self) -> np.ndarray:
+        """Coefficients s_f for z = 0 with the stamp about the chief ray, (F, 8)."""
+        return monomial_coefficients(self.mean, self.field)
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """Derivatives D_f of the coefficients by z, (F, 5, 8)."""
+        return monomial_coefficients(np.diag(self.sd), self.field[:, None])
+
+    def condition(
+        self, point: np.ndarray, score: np.ndarray, information: np.ndarray, fields: np.ndarray
+    ) -> Components:
+        """Multiply the prior of each field by the likelihood about an expansion point.
+
+        Parameters
+        ----------
+        point : ndarray, shape (n, 8)
+            Expansion points c⁰.
+        score, information : ndarray, shapes (n, 8) and (n, 8, 8)
+            g and M of the n stars.
+        fields : ndarray of int, shape (n, f)
+            Fields of each star.
+        """
+        count, size = fields.shape
+        directions = self.directions[fields]
+        terms = directions.shape[2]
+        # A = D M Dᵀ + 1 of all fields, as products with one M for each star.
+        weighted_directions = (directions.reshape(count, -1, len(MONOMIALS)) @ information).reshape(
+            directions.shape
+        )
+        curvature = weighted_directions @ directions.swapaxes(2, 3) + np.eye(terms)
+        covariance, log_determinant = invert(curvature)
+        # e = s − c⁰. A pixel's width is a tilt by half of it in λ/D: tilts that whole pixels leave,
+        # of the two offsets on either side along each axis.
+        gap = np.repeat((self.static[fields] - point[:, None])[:, :, None], 4, axis=2)
+        step = 0.5 * self.pixel
+        remainder = np.mod(gap[..., -2:], step)
+        gap[..., -2:] = remainder - step * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        # ⟨z⟩ = A⁻¹ D (g − M e), and the logarithm of the mass.
+        curved_gap = (gap.reshape(count, -1, len(MONOMIALS)) @ information).reshape(gap.shape)
+        slope = score[:, None, None] - curved_gap
+        right_side = slope @ directions.swapaxes(2, 3)
+        z = right_side @ covariance
+        limited_z = np.clip(z, -self.max_abs_z, self.max_abs_z)
+        log_mass = (gap * (slope + 0.5 * curved_gap)).sum(axis=3)
+        log_mass += 0.5 * ((right_side * z).sum(axis=3) - log_determinant[:, :, None])
+        shift = (gap + limited_z @ directions).reshape(count, 4 * size, -1)
+        field_covariance = directions.swapaxes(2, 3) @ covariance @ directions
+        return Components(log_mass.reshape(count, -1), shift, field_covariance)
+
+
+class Components(NamedTuple):
+    """Posterior of each star as a mixture of Gaussians of δ, over f fields and four offsets.
+
+    Attributes
+    ----------
+    log_mass : ndarray, shape (n, 4 f)
+        Logarithms of the masses; the offsets of a field are neighbours.
+    shift : ndarray, shape (n, 4 f, 8)
+        Mean of δ in each component.
+    covariance : ndarray, shape (n, f, 8, 8)
+        Covariance of δ in each field.
+    """
+
+    log_mass: np.ndarray
+    shift: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def evidence(self) -> np.ndarray:
+        """Logarithm of the total mass of each star, (n,)."""
+        return np.asarray(np.logaddexp.reduce(self.log_mass, axis=1))
+
+    @property
+    def mode(self) -> np.ndarray:
+        """Mean of δ in the component of the largest mass, (n, 8)."""
+        return np.asarray(self.shift[np.arange(len(self.shift)), self.log_mass.argmax(axis=1)])
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (n, 8) and covariance (n, 8, 8) of δ under the mixture."""
+        weight = np.exp(self.log_mass - self.evidence[:, None])
+        mean = np.einsum("nk,nka->na", weight, self.shift)
+        # Within the components, and between their means.
+        of_field = weight.reshape(len(weight), -1, 4).sum(axis=2)
+        covariance = np.einsum("nf,nfab->nab", of_field, self.covariance)
+        offsets = (self.shift - mean[:, None]) * np.sqrt(weight)[:, :, None]
+        return mean, covariance + offsets.swapaxes(1, 2) @ offsets
+
+
+def invert(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return inverses and logarithms of the determinants of positive definite matrices (..., k, k).
+
+    Gauss–Jordan elimination of all matrices at once: for many small matrices, it takes a tenth of
+    the time of a factorisation of each.
+    """
+    inverse = np.ascontiguousarray(np.moveaxis(matrices, (-2, -1), (0, 1)))
+    log_determinant = np.zeros(inverse.shape[2:])
+    for p in range(len(inverse)):
+        pivot = inverse[p, p].copy()
+        log_determinant += np.log(pivot)
+        inverse[p, p] = 1.0
+        inverse[p] /= pivot
+        for row in range(len(inverse)):
+            if row != p:
+                factor = inverse[row, p].copy()
+                inverse[row, p] = 0.0
+                inverse[row] -= factor * inverse[p]
+    return np.ascontiguousarray(np.moveaxis(inverse, (0, 1), (-2, -1))), log_determinant
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """Stamps of wavefronts, the likelihood of photons about them, and the posterior.
+
+    Attributes
+    ----------
+    point : ndarray, shape (n, 8)
+        Coefficients c⁰.
+    stamps, slopes : ndarray, shapes (n, P) and (n, 8, P)
+        Stamps of sum 1, and their derivatives by c.
+    deviance : ndarray, shape (n,)
+        −2 ln L(c⁰), relative to the counts themselves.
+    information : ndarray, shape (n, 8, 8)
+        Fisher information M.
+    components : Components
+        Posterior of δ.
+    """
+
+    point: np.ndarray
+    stamps: np.ndarray
+    slopes: np.ndarray
+    deviance: np.ndarray
+    information: np.ndarray
+    components: Components
+
+    @property
+    def evidence(self) -> np.ndarray:
+        """Logarithm of the integral of prior × likelihood, (n,)."""
+        return np.asarray(self.components.evidence - 0.5 * self.deviance)
+
+    @property
+    def gain(self) -> np.ndarray:
+        """Gain ½ δᵀMδ of a step to the most likely component, (n,)."""
+        shift = self.components.mode
+        return np.asarray(0.5 * np.einsum("na,nab,nb->n", shift, self.information, shift))
+
+    def moments(self, stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return posterior mean and variance of the stamps of some stars, (m, P) both."""
+        # ⟨p⟩ = p + ⟨δ⟩ᵀ∂p and var p = ∂pᵀ cov(δ) ∂p.
+        components = Components(*(values[stars] for values in self.components))
+        mean, covariance = components.moments()
+        slopes = self.slopes[stars]
+        psf = self.stamps[stars] + (mean[:, None] @ slopes)[:, 0]
+        return psf, ((covariance @ slopes) * slopes).sum(axis=1)
+
+
+class NetworkStarts(NamedTuple):
+    """Results of a network from which wavefronts are refined.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, K, 8)
+        Coefficients of K wavefronts of each star, the most likely first.
+    psf, variance : ndarray, shape (n, P)
+        PSF of the network, and its variance.
+    """
+
+    points: np.ndarray
+    psf: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def compute(
+        cls, network: PosteriorNetwork, noisy: np.ndarray, level: np.ndarray, pixel: float
+    ) -> NetworkStarts:
+        """Apply a network to images (n, d, d) of levels (n,); `pixel` is its width in λ/D."""
+        estimate = network.estimate(noisy, level, None)
+        order = np.argsort(-estimate.log_weight, axis=1)
+        wavefront = np.take_along_axis(estimate.wavefront, order[:, :, None], axis=1)
+        psf, sigma = (
+            values.reshape(len(noisy), -1).astype(np.float64)
+            for values in (estimate.psf, estimate.sigma)
+        )
+        return cls(WavefrontCoordinates.decode(wavefront, pixel), psf, sigma**2)
+
+
+class RefinedPsfs(NamedTuple):
+    """Posterior means of n stars about their refined wavefronts.
+
+    Attributes
+    ----------
+    psf, variance : ndarray, shape (n, P)
+        Mean and variance of the noise-free stamp.
+    """
+
+    psf: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Refiner:
+    """Optics of a telescope that refine proposals of wavefronts.
+
+    Attributes
+    ----------
+    prior : SeidelPrior
+        Distribution of the wavefronts.
+    obscuration : float
+        Linear central obscuration of the pupil.
+    stamp_px : int
+        Pixels d along a side.
+    noise : NoiseModel
+        Photon noise of the images.
+    max_steps : int
+        Maximum number of expansions of a climb, at least two.
+    min_gain : float
+        A climb ends where the next step would raise the logarithm of the posterior by less.
+    max_distance : float
+        Mean squared difference between a refined PSF and the network's, in units of the sum of
+        their variances, above which the next proposal is tried.
+    fields_kept : int
+        Fields that expansions after the first one consider, the most likely of the first.
+    batch : int
+        Stars that are refined together.
+    """
+
+    prior: SeidelPrior
+    obscuration: float
+    stamp_px: int
+    noise: NoiseModel
+    max_steps: ClassVar[int] = 3
+    min_gain: ClassVar[float] = 1.0
+    max_distance: ClassVar[float] = 1.2
+    fields_kept: ClassVar[int] = 24
+    batch: ClassVar[int] = 256
+    pupil_samples: ClassVar[tuple[int, ...]] = (
+        *(32, 40, 48, 56, 64, 72, 80, 88, 96, 108, 120, 132, 144, 158),
+        *(190, 222, 254, 318, 398, 478, 574, 690, 830, 1000),
+    )
+    """Pupil grids, of which a wavefront uses the smallest one that its slopes allow."""
+
+    @cached_property
+    def _operator(self) -> SampledStamps:
+        """Propagator of stamps and their derivatives."""
+        return SampledStamps(
+            self.obscuration,
+            monomial_images,
+            PointSampling,
+            self.stamp_px,
+            self.prior.pixel,
+            "complex64",
+            self.pupil_samples,
+            batch=32 * len(MONOMIALS),
+        )
+
+    def expand(
+        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
+    ) -> Expansion:
+        """Expand the posteriors of n stars about wavefronts.
+
+        Parameters
+        ----------
+        point : ndarray, shape (n, 8)
+            Coefficients c⁰.
+        counts : ndarray, shape (n, P)
+            Photons in every pixel, sky included.
+        flux : ndarray, shape (n,)
+            Photons F of each star.
+        fields : ndarray of int, shape (n, f)
+            Fields that are considered for each star.
+        """
+        axes = np.broadcast_to(np.eye(len(MONOMIALS)), (len(point), *[len(MONOMIALS)] * 2))
+        raw = self._operator.derivatives(point, axes)
+        stamps, slopes, _ = normalise_with_derivatives(*raw)
+        stamps = stamps.reshape(len(point), -1).astype(np.float64)
+        slopes = slopes.reshape(len(point), len(MONOMIALS), -1).astype(np.float64)
+        # Poisson likelihood of the counts, of mean F p + B.
+        deviance, score, information = poisson_information(
+            counts,
+            flux[:, None] * stamps + self.noise.background,
+            flux[:, None, None] * slopes,
+        )
+        components = self.prior.condition(point, score, information, fields)
+        return Expansion(point, stamps, slopes, deviance, information, components)
+
+    def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
+        """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
+
+        A star's proposals are refined one after the other until a stamp is near the network's PSF.
+        """
+        count = len(noisy)
+        flux = self.noise.flux(level)
+        # Counts are whole numbers: rounding undoes the loss of the images' single precision.
+        images = noisy.reshape(count, -1).astype(np.float64)
+        counts = np.rint(flux[:, None] * images) + self.noise.background
+        shape = starts.points.shape[:2]
+        psf, variance = np.zeros((2, *shape, images.shape[1]))
+        evidence = np.full(shape, -np.inf)
+        open_stars = np.arange(count)
+        for k in range(shape[1]):
+            # Derivatives of a batch of stars fit in the cache.
+            for first in range(0, open_stars.size, self.batch):
+                stars = open_stars[first : first + self.batch]
+                peaks = self.climb(starts.points[stars, k], counts[stars], flux[stars])
+                psf[stars, k], variance[stars, k], evidence[stars, k] = peaks
+            distance = (psf[open_stars, k] - starts.psf[open_stars]) ** 2
+            distance /= starts.variance[open_stars] + variance[open_stars, k]
+            open_stars = open_stars[distance.mean(axis=1) > self.max_distance]
+        # Means over the wavefronts of a star, with their posterior probabilities.
+        weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+        weight = (weight / weight.sum(axis=1, keepdims=True))[:, :, None]
+        mean = (weight * psf).sum(axis=1)
+        variance += (psf - mean[:, None]) ** 2
+        return RefinedPsfs(mean, (weight * variance).sum(axis=1))
+
+    def climb(
+        self, start: np.ndarray, counts: np.ndarray, flux: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Move wavefronts to maxima of the posterior, and expand it there.
+
+        Parameters
+        ----------
+        start : ndarray, shape (n, 8)
+            Coefficients at which the climbs begin.
+        counts, flux : ndarray, shapes (n, P) and (n,)
+            Photons of the pixels, and of the star.
+
+        Returns
+        -------
+        psf, variance : ndarray, shape (n, P)
+            Posterior mean and variance of the stamp.
+        evidence : ndarray, shape (n,)
+            Logarithm of the integral of prior × likelihood.
+        """
+        every_field = np.arange(len(self.prior.field))
+        fields = np.broadcast_to(every_field, (len(start), every_field.size))
+        psf, variance = np.empty((2, *counts.shape))
+        evidence, stars, point = np.empty(len(start)), np.arange(len(start)), start
+        for step in range(self.max_steps):
+            expansion = self.expand(point, counts[stars], flux[stars], fields)
+            is_last = np.full(len(stars), step + 1 == self.max_steps)
+            if step:
+                is_last |= expansion.gain < self.min_gain
+            if is_last.any():
+                psf[stars[is_last]], variance[stars[is_last]] = expansion.moments(is_last)
+                evidence[stars[is_last]] = expansion.evidence[is_last]
+            # The most likely fields, by the best offset of each.
+            components = expansion.components
+            log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)[~is_last]
+            number = min(self.fields_kept, fields.shape[1])
+            likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
+            fields = np.take_along_axis(fields[~is_last], likely, axis=1)
+            point = (expansion.point + components.mode)[~is_last]
+            stars = stars[~is_last]
+            if not stars.size:
+                break
+        return psf, variance, evidence
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Weights of refined PSFs in their means with the PSFs of a network, by noise level.
+
+    The weight of a star is w = 1 / (1 + exp(−k·x)) with x = (1, ln(V_n/V_r), ln(Δ²/V_n)): V_n and
+    V_r are the variances of network and refined wavefront, and Δ is the difference of both PSFs.
+
+    Attributes
+    ----------
+    levels : ndarray, shape (L,)
+        Noise levels λ, ascending.
+    factors : ndarray, shape (L, 3)
+        Factors k at each level.
+    sigma_scale, sigma_ratio95 : ndarray, shape (L,)
+        Factor of the standard deviations at each level, and how many of them contain 95 % of the
+        errors.
+    """
+
+    levels: np.ndarray
+    factors: np.ndarray
+    sigma_scale: np.ndarray
+    sigma_ratio95: np.ndarray
+
+    @classmethod
+    def fit(
+        cls, level: np.ndarray, starts: NetworkStarts, posteriors: RefinedPsfs, truth: np.ndarray
+    ) -> Combination:
+        """Minimise the mean squared error of stars at each of their levels, and calibrate σ.
+
+        Parameters
+        ----------
+        level : ndarray, shape (n,)
+            Noise level of each star.
+        starts, posteriors : NetworkStarts, RefinedPsfs
+            Their estimates by the network and by the optics.
+        truth : ndarray, shape (n, P)
+            Noise-free stamps.
+        """
+        from scipy.optimize import minimize
+
+        # |m + w (r − m) − p|² = |m − p|² − 2 w (r − m)·(p − m) + w² |r − m|².
+        change = posteriors.psf - starts.psf
+        projection = (change * (truth - starts.psf)).sum(axis=1)
+        square = (change**2).sum(axis=1)
+        levels, features, factors = np.unique(level), cls.describe(starts, posteriors), []
+        for value in levels:
+            rows = np.flatnonzero(level == value)
+
+            def loss(k: np.ndarray, rows: np.ndarray = rows) -> float:
+                weight = compute_sigmoid(features[rows] @ k)
+                gain = 2.0 * weight * projection[rows] - weight**2 * square[rows]
+                # Factors of stars that differ little from each other stay finite.
+                return float(-gain.mean() / square[rows].mean() + 1e-4 * (k @ k))
+
+            start = np.array([0.0, 1.0, -1.0])
+            factors.append(minimize(loss, start, method="Nelder-Mead").x)
+        weights = cls(levels, np.array(factors), *np.ones((2, len(levels))))
+        # The factors of σ by which it holds 68 % and 95 % of the errors.
+        psf, sigma = weights.combine(level, starts, posteriors)
+        ratio = np.abs(psf - truth) / sigma
+        scale68, scale95 = np.array(
+            [np.quantile(ratio[level == value], [0.682689, 0.95]) for value in levels]
+        ).T
+        return replace(weights, sigma_scale=scale68, sigma_ratio95=scale95 / scale68)
+
+    @staticmethod
+    def describe(starts: NetworkStarts, posteriors: RefinedPsfs) -> np.ndarray:
+        """Return the variables x (n, 3) of the weights."""
+        network_variance, refined_variance, difference = (
+            np.maximum(values.mean(axis=1), np.finfo(float).tiny)
+            for values in (
+                starts.variance,
+                posteriors.variance,
+                (posteriors.psf - starts.psf) ** 2,
+            )
+        )
+        ratios = network_variance / refined_variance, difference / network_variance
+        return np.stack([np.ones(len(difference)), *np.log(ratios)], axis=1)
+
+    def combine(
+        self, level: np.ndarray, starts: NetworkStarts, posteriors: RefinedPsfs
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the means of both PSFs (n, P) at levels (n,), and their standard deviations."""
+        # Values between levels are interpolated in ln λ.
+        columns = np.column_stack([self.factors, self.sigma_scale]).T
+        values = [np.interp(np.log(level), np.log(self.levels), column) for column in columns]
+        *factors, scale = values
+        features = self.describe(starts, posteriors)
+        weight = compute_sigmoid((features * np.stack(factors, axis=1)).sum(axis=1))[:, None]
+        change = posteriors.psf - starts.psf
+        # Variance of a mixture of both, with the square of their difference.
+        variance = (1.0 - weight) * starts.variance
+        variance += weight * (posteriors.variance + (1.0 - weight) * change**2)
+        return starts.psf + weight * change, scale[:, None] * np.sqrt(variance)
+
+
+def compute_sigmoid(x: np.ndarray) -> np.ndarray:
+    """Return 1 / (1 + exp(−x))."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))

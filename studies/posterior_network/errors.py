@@ -1,0 +1,104 @@
+"""Errors, coverage and time of a network, alone and with wavefronts that the optics refine.
+
+    python studies/posterior_network/errors.py RESULTS DATASET OUT.csv [OVERRIDE ...]
+
+RESULTS is the folder of a run with the stars of DATASET; settings are changed by overrides such as
+posterior_network.epochs=8. The least possible errors are those of the run of record. One thread.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+import numpy as np
+import pandas as pd
+import torch
+
+from psfdae.base.files import read_product
+from psfdae.base.threads import limit_threads
+from psfdae.methods import method
+from psfdae.methods.metrics import mse
+from psfdae.training.star_sets import training_set
+from psfdae_paper.bounds.estimates import SPLIT, read_test_stars
+from psfdae_paper.configuration.compose import load
+
+ROOT = Path(__file__).parents[2]
+STARS = {"dataset3": "data/seidel/seidel_10pct.h5", "dataset5": "data/seidel/seidel_50pct.h5"}
+
+
+def read_least_errors(dataset):
+    """Return the error of the posterior mean by noise level, and whether it is tight."""
+    table = pd.read_csv(ROOT / "results/reference/tables/psf_bounds.csv", low_memory=False)
+    query = "dataset == @dataset and reference == 'realisation' and metric == 'mse'"
+    rows = table.query(f"{query} and method == 'bayes'").set_index("noise_level")
+    return rows[["value", "tight"]]
+
+
+def measure(fitted, config, tested, dataset):
+    """Yield a row of errors for each noise level."""
+    truth, least = tested.truth["realisation"], read_least_errors(dataset)
+    for level in config.noise.levels:
+        noisy = tested.noisy[level]
+        fitted.estimate(noisy[:2], level)
+        start = process_time()
+        estimate = fitted.estimate(noisy, level)
+        seconds = process_time() - start
+        error, ratio = mse(estimate.psf, truth).mean(), np.abs(estimate.psf - truth)
+        ratio /= estimate.sigma
+        levels, ratio95 = fitted.calibration
+        ratio95 = np.interp(np.log(level), np.log(levels), ratio95)
+        yield {
+            "noise_level": level,
+            "mse": f"{error:.4e}",
+            "mse_least": f"{least.value[level]:.4e}",
+            "tight": least.tight[level],
+            "over_least": f"{error / least.value[level]:.3f}",
+            "coverage68": f"{(ratio < 1).mean():.4f}",
+            "coverage95": f"{(ratio < ratio95).mean():.4f}",
+            "ms_per_star": f"{1e3 * seconds / len(noisy):.3f}",
+        }
+
+
+def main(results, dataset, out, *overrides):
+    """Fit the network with its optics, and append rows to a table."""
+    limit_threads(1)
+    torch.set_num_threads(1)
+    config = load([f"dataset={dataset}", *overrides])
+    product = read_product(Path(results) / STARS[dataset], "stars")
+    refined, settings = method("posterior_network_refined"), config.posterior_network
+    with TemporaryDirectory() as folder:
+        kinds = config, refined, product, SPLIT, "realisation"
+        data = training_set(*kinds, checkpoint=Path(folder, "checkpoint"))
+        start = process_time()
+        fitted = refined.fit(data, settings)
+        fit_s = process_time() - start
+    tested, path = read_test_stars(config, product), Path(out)
+    # The network alone is a part of the same fit.
+    alone = method("posterior_network")(fitted.network)
+    methods = {"posterior_network": alone, "posterior_network_refined": fitted}
+    rows = [
+        {
+            "dataset": dataset,
+            "method": name,
+            "epochs": settings.epochs,
+            "stars_per_epoch": settings.stars,
+            "fit_cpu_s": f"{fit_s:.1f}",
+            **row,
+        }
+        for name, kind in methods.items()
+        for row in measure(kind, config, tested, dataset)
+    ]
+    is_new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        if is_new:
+            writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,198 @@
+"""Wavefronts refined by the optics: closed forms, limits, and the maximum of the posterior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psfdae.optics.wavefronts import monomial_coefficients
+from psfdae.stars.noise import NoiseModel
+from psfdae_paper.bounds.estimates import build_stamp_model
+from psfdae_paper.bounds.mode_search import climb
+from psfdae_paper.bounds.modes import Knowledge, Modes
+from psfdae_paper.bounds.posterior import Likelihood
+from psfdae_paper.bounds.refinement import (
+    Combination,
+    NetworkStarts,
+    RefinedPsfs,
+    Refiner,
+    SeidelPrior,
+    invert,
+)
+from psfdae_paper.bounds.stamp_model import StarPosteriors
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION
+
+NOISE = NoiseModel(kappa=4.98, background=1e4)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Stamps of dataset 3."""
+    return build_stamp_model(load_stage(SIMULATION, ("dataset=dataset3",)))
+
+
+def build_refiner(model, fields=slice(None)):
+    prior = SeidelPrior(model.mean, model.sd, model.field[fields], model.telescope.pixel)
+    return Refiner(prior, model.telescope.obscuration, model.framing.stamp_px, NOISE)
+
+
+def propose(points, psf):
+    """Proposals (n, K, 8), and a network whose PSFs have an RMS error of 0.001."""
+    psf = psf.reshape(len(psf), -1)
+    return NetworkStarts(points, psf, np.full_like(psf, 1e-6))
+
+
+def draw_stars(model, count, seed):
+    """Draw stars of the prior: noise-free stamps, their z, fields, offsets and coefficients."""
+    rng = np.random.default_rng(seed)
+    # Inner fields, whose stars are bright at the chief ray, the middle of the stamps.
+    inner = np.flatnonzero(np.hypot(*model.field.T) < 0.7)
+    z, field = rng.standard_normal((count, 5)), rng.choice(inner, count)
+    offset = np.zeros((count, 2), int)
+    stamps = model.stamps(z, field, offset).astype(np.float64)
+    point = model.coefficients(z, field)
+    return stamps, z, field, offset, point
+
+
+def test_inverses_are_those_of_linear_algebra():
+    rng = np.random.default_rng(0)
+    roots = rng.standard_normal((3, 4, 5, 5))
+    matrices = roots @ roots.swapaxes(2, 3) + np.eye(5)
+    inverse, log_determinant = invert(matrices)
+    assert inverse == pytest.approx(np.linalg.inv(matrices), rel=1e-9, abs=1e-12)
+    assert log_determinant == pytest.approx(np.linalg.slogdet(matrices)[1], rel=1e-12)
+
+
+def test_posterior_of_a_linear_stamp_is_the_integral_over_the_prior():
+    """One coefficient varies: mass and mean of each offset are integrals over a single z."""
+    rng = np.random.default_rng(1)
+    prior = SeidelPrior(
+        np.array([0.5, 4.0, 4.2, 1.8, -0.1]),
+        np.array([0.0, 0.4, 0.0, 0.0, 0.0]),
+        np.array([[0.4, -0.2]]),
+        pixel=0.9,
+    )
+    root = rng.standard_normal((8, 12))
+    score, information = 20.0 * rng.standard_normal(8), 30.0 * root @ root.T
+    # The expansion point is displaced by whole pixels and a little.
+    point = prior.static[0] + 0.05 * rng.standard_normal(8)
+    point[-2:] -= 0.5 * prior.pixel * np.array([3, -2])
+    components = prior.condition(point[None], score[None], information[None], np.zeros((1, 1), int))
+    z = np.linspace(-9.0, 9.0, 4001)
+    wavefronts = monomial_coefficients(prior.mean + z[:, None] * prior.sd, prior.field[0])
+    masses, sums = [], []
+    for x in range(-6, 7):
+        for y in range(-6, 7):
+            delta = wavefronts - point
+            delta[:, -2:] -= 0.5 * prior.pixel * np.array([x, y])
+            log = delta @ score - 0.5 * ((delta @ information) * delta).sum(axis=1) - 0.5 * z**2
+            density = np.exp(log) / np.sqrt(2.0 * np.pi)
+            masses.append(np.trapezoid(density, z))
+            sums.append(np.trapezoid(density[:, None] * delta, z, axis=0))
+    # The four offsets next to the expansion point have nearly all of the mass.
+    nearest = np.argsort(masses)[::-1][:4]
+    best = nearest[0]
+    assert np.exp(components.log_mass.max()) == pytest.approx(masses[best], rel=1e-6)
+    assert components.mode[0] == pytest.approx(sums[best] / masses[best], rel=1e-6)
+    assert np.sum(masses) == pytest.approx(np.exp(components.evidence[0]), rel=1e-3)
+    mean, covariance = components.moments()
+    assert mean[0] == pytest.approx(np.sum(sums, axis=0) / np.sum(masses), abs=1e-3)
+    assert np.linalg.eigvalsh(covariance[0]).min() > -1e-12
+
+
+def test_little_noise_gives_the_star_itself(model):
+    """The error falls with λ², down to the error of the optics."""
+    stamps, *_, point = draw_stars(model, 40, 2)
+    rng = np.random.default_rng(3)
+    start = point + 0.01 * rng.standard_normal(point.shape)
+    errors = []
+    for level in (1e-4, 1e-5):
+        noisy = NOISE.draw(stamps, level, rng)
+        starts = propose(start[:, None], stamps)
+        refined = build_refiner(model).refine(noisy, np.full(40, level), starts)
+        errors.append(np.median(np.square(refined.psf - stamps.reshape(40, -1)).mean(axis=1)))
+        # All light is in the stamp.
+        assert refined.psf.sum(axis=1) == pytest.approx(1.0, abs=1e-5)
+    assert errors[0] < 0.05 * (4.98e-4) ** 2
+    assert errors[1] < 0.05 * errors[0] + 2e-9
+
+
+def test_errors_are_as_large_as_their_standard_deviations(model):
+    stamps, *_, point = draw_stars(model, 150, 4)
+    rng = np.random.default_rng(5)
+    noisy = NOISE.draw(stamps, 1e-3, rng)
+    start = point + 0.02 * rng.standard_normal(point.shape)
+    starts = propose(start[:, None], stamps)
+    refined = build_refiner(model).refine(noisy, np.full(150, 1e-3), starts)
+    error = np.square(refined.psf - stamps.reshape(150, -1)).mean()
+    assert error == pytest.approx(refined.variance.mean(), rel=0.25)
+
+
+def test_a_second_proposal_is_used_where_the_first_one_fails(model):
+    """A wavefront that is far away has a PSF unlike the network's, and little evidence."""
+    stamps, *_, point = draw_stars(model, 30, 9)
+    noisy = NOISE.draw(stamps, 1e-3, np.random.default_rng(10))
+    level, wrong = np.full(30, 1e-3), np.roll(point, 7, axis=0)
+    refiner = build_refiner(model)
+    truth = stamps.reshape(30, -1)
+    errors = [
+        np.square(refiner.refine(noisy, level, propose(points, stamps)).psf - truth).mean()
+        for points in (wrong[:, None], np.stack([wrong, point], axis=1), point[:, None])
+    ]
+    assert errors[0] > 20.0 * errors[2]
+    assert errors[1] == pytest.approx(errors[2], rel=0.2)
+
+
+def test_refined_wavefront_is_the_maximum_of_the_posterior(model, monkeypatch):
+    """In its field, at little noise, the refined PSF is the stamp of the climb's mode."""
+    stamps, z, field, offset, point = draw_stars(model, 12, 6)
+    level, rng = 5e-4, np.random.default_rng(7)
+    noisy = NOISE.draw(stamps, level, rng)
+    likelihood = Likelihood.from_noise(NOISE, level, stamps)
+    star = np.arange(12)
+    starts = Modes.make_starts(star, field, offset, np.full(12, Knowledge.FIELD), z)
+    modes = climb(starts, StarPosteriors(noisy, likelihood, model)).best_of_group
+    expected = model.stamps(modes.z, modes.field, modes.offset).reshape(12, -1)
+    monkeypatch.setattr(Refiner, "min_gain", 1e-6)
+    monkeypatch.setattr(Refiner, "max_steps", 10)
+    monkeypatch.setattr(Refiner, "pupil_samples", (126, 158, 190, 222, 254))
+    for number in star:
+        own = build_refiner(model, fields=[field[number]])
+        starts = propose(point[[number], None], stamps[[number]])
+        refined = own.refine(noisy[[number]], np.array([level]), starts)
+        # The climb's last gain is up to 0.02 in ln L: a fraction of the standard deviation.
+        distance = np.abs(refined.psf[0] - expected[number]) / np.sqrt(refined.variance[0])
+        assert np.sqrt(np.mean(distance**2)) < 0.15
+
+
+def test_a_combination_is_better_than_network_and_optics():
+    """Stars of which either the network or the optics has the larger variance."""
+    rng, count, pixels = np.random.default_rng(8), 4000, 16
+    truth = rng.random((count, pixels))
+    sd_network, sd_refined = np.exp(rng.uniform(-2, 2, (2, count, 1)))
+    network = truth + sd_network * rng.standard_normal(truth.shape)
+    refined = truth + sd_refined * rng.standard_normal(truth.shape)
+    # The optics have another wavefront for every tenth star, whose PSF is far from the network's.
+    is_wrong = np.arange(count) % 10 == 0
+    refined[is_wrong] += 50.0
+    ones = np.ones_like(truth)
+    starts = NetworkStarts(np.empty((count, 1, 8)), network, sd_network**2 * ones)
+    posterior = RefinedPsfs(refined, sd_refined**2 * ones)
+    level = np.repeat([1e-3, 3e-3], count // 2)
+    combination = Combination.fit(level, starts, posterior, truth)
+    psf, sigma = combination.combine(level, starts, posterior)
+    # The best weights are those of the variances.
+    weight = sd_network**2 / (sd_network**2 + sd_refined**2) * ~is_wrong[:, None]
+    ideal = np.square(network + weight * (refined - network) - truth).mean()
+    assert np.square(psf - truth).mean() < 1.1 * ideal
+    assert ideal < 0.7 * np.square(network - truth).mean()
+    assert (np.abs(psf - truth) < sigma).mean() == pytest.approx(0.6827, abs=0.001)
+    ratio95 = np.repeat(combination.sigma_ratio95, count // 2)[:, None]
+    assert (np.abs(psf - truth) < ratio95 * sigma).mean() == pytest.approx(0.95, abs=0.001)
+    # Between two levels, the factors are between theirs.
+    half = replace(combination, factors=np.array([[-99.0, 0, 0], [99.0, 0, 0]]))
+    middle, _ = half.combine(np.full(count, np.sqrt(3) * 1e-3), starts, posterior)
+    assert middle == pytest.approx(0.5 * (network + refined))
