@@ -201,6 +201,8 @@ class _Fit:
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
         # Places that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_place, self.pull = self.start, 0.0
+        # A star moves so little that its PSF stays as it is at the start.
+        self._splines = psfs.mix_splines(self.start, self.flux)
         self._light = np.empty((len(self.stars), side, side))
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         self._draw(np.arange(len(self.stars)))
@@ -218,7 +220,7 @@ class _Fit:
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
             corner = self._middle[part] - side // 2
-            stamps = self.psfs.stamps(self.place[part], corner, side, self.flux[part])
+            stamps = self.psfs.stamps(self.place[part], corner, side, splines=self._splines[part])
             self._light[part] = stamps[:, 0]
             self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
@@ -233,6 +235,7 @@ class _Fit:
         self.flux = flux.astype(np.float64)
         # Where the PSF changes with the magnitude, these fluxes determine it from now on.
         if self.psfs.magnitudes.size:
+            self._splines = self.psfs.mix_splines(self.start, self.flux)
             self._draw(np.arange(len(flux)))
         self._subtract(np.arange(len(flux)), self.flux)
 

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from psfdae.psf.interface import FieldPsfs
+from psfdae.psf.wings import sum_outer_part
 from psfdae.stars.bright_stars import magnitude
 
 
@@ -70,19 +71,61 @@ class PsfGrid:
 
     @cached_property
     def splines(self) -> np.ndarray:
-        """Coefficients (nodes, m + 4, m + 4) of the splines, mirrored by two at each edge."""
+        """Coefficients (nodes, m + 4, m + 4) of the splines, mirrored by two at each edge.
+
+        They are in single precision.
+        """
         from scipy.ndimage import spline_filter
 
         psfs = self.psfs.reshape(-1, *self.psfs.shape[-2:])
-        return np.stack([np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs])
+        splines = [np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs]
+        return np.stack(splines).astype(np.float32)
 
     @property
     def side_px(self) -> int:
         """Odd side of stamps that hold all light of a PSF wherever its star is in a pixel."""
         return 2 * int(self.psfs.shape[-1] // 2 // self.oversampling + 1) + 1
 
+    def mix_splines(self, centre: np.ndarray, flux: np.ndarray | None = None) -> np.ndarray:
+        """Return the splines (n, m + 4, m + 4) of stars at positions (n, 2), in single precision.
+
+        They are the means of the splines of the nodes around each star, and of three magnitudes if
+        the grid has these; for `flux` see `stamps`.
+        """
+        node, share = self._nodes(centre, np.full(len(centre), np.nan) if flux is None else flux)
+        flat = self.splines.reshape(len(self.splines), -1)
+        mixed = np.empty((len(centre), flat.shape[1]), np.float32)
+        share = share.astype(np.float32)
+        # Batches, for memory.
+        for batch in np.array_split(np.arange(len(centre)), len(centre) // 64 + 1):
+            mixed[batch] = (share[batch, None] @ flat[node[batch]])[:, 0]
+        return mixed.reshape(len(centre), *self.splines.shape[1:])
+
+    def outer_shares(self, centre: np.ndarray, flux: np.ndarray, side_px: int) -> np.ndarray:
+        """Return `psfdae.psf.wings.outer_shares` of stars from the PSFs of the nodes around them.
+
+        Parameters
+        ----------
+        centre, flux : ndarray, shape (n, 2) and (n,)
+            Positions and fluxes of the stars; the result is NaN where a position is not finite.
+        side_px : int
+            Side of the stamps, in which a PSF has the sum 1.
+        """
+        # Samples at whole pixels from the middle of the PSF.
+        in_stamp = slice(0, self.oversampling * side_px, self.oversampling)
+        node_shares = sum_outer_part(self.psfs[..., in_stamp, in_stamp]).ravel()
+        shares, is_located = np.full(len(centre), np.nan), np.isfinite(centre).all(axis=1)
+        node, weight = self._nodes(centre[is_located], flux[is_located])
+        shares[is_located] = (node_shares[node] * weight).sum(axis=1)
+        return shares
+
     def stamps(
-        self, centre: np.ndarray, corner: np.ndarray, side_px: int, flux: np.ndarray | None = None
+        self,
+        centre: np.ndarray,
+        corner: np.ndarray,
+        side_px: int,
+        flux: np.ndarray | None = None,
+        splines: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the light of stars of flux 1 in stamps of the image, and its derivatives.
 
@@ -97,6 +140,8 @@ class PsfGrid:
         flux : ndarray, shape (n,), optional
             Fluxes, counts, by which the PSFs differ if the grid has magnitudes. Where they are NaN
             or not given, the PSF is as at the middle magnitude.
+        splines : ndarray, shape (n, m + 4, m + 4), optional
+            PSFs of the stars, of `mix_splines`, for stars that are drawn again after a small move.
 
         Returns
         -------
@@ -107,62 +152,52 @@ class PsfGrid:
         light = np.zeros((len(centre), 3, side_px, side_px))
         # Position of the first pixel among the knots, along x and y:
         # u = o (pixel − centre) + m//2, with its knot ⌊u⌋ and phase u − ⌊u⌋.
-        size = self.psfs.shape[-1]
-        first = self.oversampling * (corner - centre) + size // 2
+        size, between = self.psfs.shape[-1], self.oversampling
+        first = between * (corner - centre) + size // 2
         knot = np.floor(first).astype(int)
-        pixel_knot = knot[..., None] + self.oversampling * np.arange(side_px)
+        pixel_knot = knot[..., None] + between * np.arange(side_px)
         is_inside = (pixel_knot >= 0) & (pixel_knot + (first > knot)[..., None] <= size - 1)
         # Stamps with at least one pixel within the PSF; all others stay 0.
         stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
-        node, share = self._nodes(centre, np.full(len(centre), np.nan) if flux is None else flux)
-        weights, slopes = knot_weights(first - knot)
-        span = self.oversampling * (side_px - 1) + 1
-        # Stamps may reach beyond a PSF: pad its spline with zeros, by no more than they do.
-        begin, end = knot[stars] + 1, self.splines.shape[-1]
-        room = max(0, -begin.min(initial=0), begin.max(initial=0) + span + 3 - end)
-        splines = np.pad(self.splines, ((0, 0), *[(room, room)] * 2))
-        taps = [slice(t, t + span, self.oversampling) for t in range(4)]
-        # Batches, for memory: a pixel needs some 20 coefficients.
+        weights, slopes = (kernel.astype(np.float32) for kernel in knot_weights(first - knot))
+        # Stamps may reach beyond a PSF: pad its spline with zeros, by no more than they do. Four
+        # coefficients from the knot before the first pixel on are its taps.
+        begin, span = knot[stars] + 1, between * (side_px - 1) + 4
+        end = self.splines.shape[-1]
+        room = max(0, -begin.min(initial=0), begin.max(initial=0) + span - end)
+        # Batches, for memory: a pixel needs 16 coefficients.
         for batch in np.array_split(stars, len(stars) * side_px**2 // 2**17 + 1):
-            first_spline = knot[batch] + room + 1
-            squares = self._squares(splines, node[batch], share[batch], first_spline, span + 3)
-            # Σ over the four coefficients around each pixel, along x, then along y:
-            # light, ∂/∂x with the slopes along x, ∂/∂y with those along y.
-            smooth, steep = (
-                sum(
-                    kernel[batch, 0, t, None, None] * squares[:, :, tap]
-                    for t, tap in enumerate(taps)
-                )
-                for kernel in (weights, slopes)
+            if splines is None:
+                mixed = self.mix_splines(centre[batch], None if flux is None else flux[batch])
+            else:
+                mixed = splines[batch]
+            mixed = np.pad(mixed, ((0, 0), *[(room, room)] * 2))
+            # View of the 4 × 4 taps of all pixels of a stamp that begins at any coefficient:
+            # pixels are o coefficients apart.
+            star_step, down, across = mixed.strides
+            taps = np.lib.stride_tricks.as_strided(
+                mixed,
+                (len(mixed), *[end + 2 * room - span + 1] * 2, 4, 4, side_px, side_px),
+                (star_step, down, across, down, across, between * down, between * across),
+                writeable=False,
             )
-            for derivative, (values, kernel) in enumerate(
-                ((smooth, weights), (steep, weights), (smooth, slopes))
-            ):
-                light[batch, derivative] = sum(
-                    kernel[batch, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
-                )
+            column, row = knot[batch].T + room + 1
+            taps = taps[np.arange(len(batch)), row, column].reshape(len(batch), 16, side_px**2)
+            # Σ over the taps: light, ∂/∂x with the slopes along x, ∂/∂y with those along y.
+            (x, y), (x_slope, y_slope) = (a[batch].swapaxes(0, 1) for a in (weights, slopes))
+            kernels = np.stack(
+                [
+                    y[:, :, None] * x[:, None],
+                    y[:, :, None] * x_slope[:, None],
+                    y_slope[:, :, None] * x[:, None],
+                ],
+                axis=1,
+            ).reshape(len(batch), 3, 16)
+            light[batch] = (kernels @ taps).reshape(len(batch), 3, side_px, side_px)
         # A star that moves by a pixel moves by −o knots under its pixels.
-        light[:, 1:] *= -self.oversampling
+        light[:, 1:] *= -between
         light *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
         return light
-
-    @staticmethod
-    def _squares(
-        splines: np.ndarray, node: np.ndarray, share: np.ndarray, begin: np.ndarray, side: int
-    ) -> np.ndarray:
-        """Return the coefficients (n, side, side) of the splines at the positions of n stars.
-
-        They are the means of the splines of k nodes `node` (n, k), weighted by `share` (n, k),
-        from the column and row `begin` (n, 2) on.
-        """
-        # One star at a time: each needs another part of its splines.
-        squares = np.empty((len(node), side, side))
-        for star, (column, row) in enumerate(begin.tolist()):
-            square = np.s_[row : row + side, column : column + side]
-            squares[star] = share[star, 0] * splines[node[star, 0]][square]
-            for corner in range(1, node.shape[1]):
-                squares[star] += share[star, corner] * splines[node[star, corner]][square]
-        return squares
 
     def _nodes(self, centre: np.ndarray, flux: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (n, 4 or 12) of the nodes around each star, and their weights."""

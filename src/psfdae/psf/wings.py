@@ -206,14 +206,18 @@ def outer_shares(
     # Some at a time, so that their PSFs take little memory.
     for first in range(0, len(rows_with_position), 2048):
         part = rows_with_position[first : first + 2048]
-        psf = draw(position[part])
-        side = psf.shape[-1]
-        # Pixels by their distance from the middle of the stamp.
-        axis = np.arange(side) - side // 2
-        radius = np.hypot(axis[:, None], axis)
-        ring = (radius >= Wings.outer_part_from * side / 2) & (radius < side / 2)
-        shares[part] = psf[:, ring].sum(axis=1)
+        shares[part] = sum_outer_part(draw(position[part]))
     return shares
+
+
+def sum_outer_part(psf: np.ndarray) -> np.ndarray:
+    """Return the sum of the outer part of stamps (…, d, d), each with its star in the middle."""
+    # Pixels by their distance from the middle of the stamp.
+    side = psf.shape[-1]
+    axis = np.arange(side) - side // 2
+    radius = np.hypot(axis[:, None], axis)
+    ring = (radius >= Wings.outer_part_from * side / 2) & (radius < side / 2)
+    return np.asarray(psf[..., ring].sum(axis=-1))
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
