@@ -106,7 +106,11 @@ class CrowdedPhotometry:
 
 
 def photometry(
-    model: FieldPsfs, observation: Image, threshold: float = RESIDUAL_SNR, turns: int = 5
+    model: FieldPsfs,
+    observation: Image,
+    threshold: float = RESIDUAL_SNR,
+    turns: int = 5,
+    with_wings: bool = True,
 ) -> CrowdedPhotometry:
     """Fit positions and fluxes of all stars of an image.
 
@@ -120,6 +124,9 @@ def photometry(
         Minimum S/N of stars that are found where the models of others are subtracted.
     turns : int
         Maximum number of joint fits, at least 2; stars are looked for after all but the last two.
+    with_wings : bool
+        Measure the wings of the stars and the halos of saturated ones, which takes as long as the
+        rest. Otherwise, the wings of the model are used, if it has any.
 
     Raises
     ------
@@ -167,11 +174,20 @@ def photometry(
         place_prior = list_places(fit, origin, fwhm) if is_listed else None
         # Sky and light beyond the stamps, from the image without the light of stars.
         earlier_level = sky.level
-        fluxes = StarFluxes(place, flux, outer_shares(model.draw_on_pixels, place, flux / unit))
+        fluxes = StarFluxes(place, flux, psfs.outer_shares(place, flux, side))
         # The first fluxes are off by the light of unknown wings: it is enough to know these to
         # their standard error, and to a tenth of it afterwards.
         sky, wing_light, wings, halo_error = around_stars(
-            image, sky, error, fit.light, fluxes, side, wings, 0.1 if turn else 1.0, is_saturated
+            image,
+            sky,
+            error,
+            fit.light,
+            fluxes,
+            side,
+            wings,
+            0.1 if turn else 1.0,
+            is_saturated,
+            with_wings,
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         error = pixel_error(sky.noise, fit.light + wing_light, gain)

@@ -18,7 +18,7 @@ from psfdae.image.sky import Sky, subtract_sky
 from psfdae.image.sky_level import level_and_noise
 from psfdae.image.trails import find_saturated_cores
 from psfdae.psf.wings import Wings, compute_prior_profile, tents
-from psfdae.stars.moments import dither
+from psfdae.stars.moments import dither, label_medians
 
 
 class StarFluxes(NamedTuple):
@@ -45,13 +45,30 @@ class StarFluxes(NamedTuple):
         return StarFluxes(*(values[rows] for values in self))
 
 
-def star_tents(
-    rows: slice, width: int, stars: StarFluxes, wings: Wings
-) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield windows about the 1000 stars of the brightest wings, and F s h_k in them.
+BINS_PER_PX = 64
+"""Distances of pixels from stars are rounded to this part of a pixel: wings are smooth."""
 
-    A window has rows, counted from `rows.start`, and columns; F s h_k has the shape (K, rows,
-    columns). The image is `width` px wide.
+
+def tabulate_tents(wings: Wings) -> np.ndarray:
+    """Return h_0 … h_{K−1} in bins of the distance from a star, shape (bins, K).
+
+    The first bin is the stamp, where h_0 is 1 and the tents are 0.
+    """
+    # The corner of a window is √2 times as far as its edge.
+    last = int(np.ceil(1.5 * (wings.radius_px[-1] + 1.0) * BINS_PER_PX))
+    distance = np.arange(last + 1, dtype=np.float32) / BINS_PER_PX
+    heights = np.pad(tents(distance, wings.radius_px), ((1, 0), (1, 0)))
+    heights[0, 0] = 1.0
+    return np.ascontiguousarray(heights.T)
+
+
+def star_bins(
+    rows: slice, width: int, stars: StarFluxes, wings: Wings
+) -> Iterator[tuple[tuple[slice, slice], float, np.ndarray]]:
+    """Yield windows about the 1000 stars of the brightest wings, F s, and bins of their pixels.
+
+    A window has rows, counted from `rows.start`, and columns; the bins (rows, columns) are indices
+    of `tabulate_tents`. The image is `width` px wide.
     """
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
@@ -75,25 +92,24 @@ def star_tents(
         across = (np.arange(column, column_end) - x).astype(np.float32)
         down = (np.arange(row, row_end) - y).astype(np.float32)
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
-        # h_0 is 1 in the stamp, and the tents are 0 there.
-        in_stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
-        tents_outside = np.where(in_stamp, 0.0, tents(distance, radius))
+        bins = (distance * BINS_PER_PX + 1.5).astype(np.int32)
+        bins[(np.abs(down)[:, None] < radius[0]) & (np.abs(across) < radius[0])] = 0
         window = np.s_[row - rows.start : row_end - rows.start, column:column_end]
-        yield window, float(scaled_flux[star]) * np.concatenate([in_stamp[None], tents_outside])
+        yield window, float(scaled_flux[star]), bins
 
 
 def draw_tents(
     shape: tuple[int, ...], stars: StarFluxes, wings: Wings
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
-    height, width = shape
+    (height, width), heights = shape, tabulate_tents(wings)
     # The tents of a whole image would take K times its memory.
     for top in steps("wings", range(0, height, 128)):
         rows = slice(top, min(top + 128, height))
-        band_tents = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
-        for window, tents_of_star in star_tents(rows, width, stars, wings):
-            band_tents[:, *window] += tents_of_star
-        yield rows, band_tents
+        band_tents = np.zeros((rows.stop - top, width, len(wings.profile)), np.float32)
+        for window, scaled_flux, bins in star_bins(rows, width, stars, wings):
+            band_tents[window] += scaled_flux * np.take(heights, bins, axis=0, mode="clip")
+        yield rows, np.moveaxis(band_tents, 2, 0)
 
 
 def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
@@ -101,8 +117,9 @@ def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -
     # One map, to which each star adds the light in its window.
     image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
     if wings is not None:
-        for window, tents_of_star in star_tents(rows, shape[1], stars, wings):
-            image[window] += np.tensordot(wings.profile, tents_of_star, 1)
+        light = (tabulate_tents(wings) @ wings.profile).astype(np.float32)
+        for window, scaled_flux, bins in star_bins(rows, shape[1], stars, wings):
+            image[window] += scaled_flux * np.take(light, bins, mode="clip")
     return image
 
 
@@ -230,6 +247,7 @@ def around_stars(
     earlier: Wings | None,
     tolerance: float,
     is_saturated: np.ndarray,
+    with_wings: bool = True,
 ) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
 
@@ -251,6 +269,8 @@ def around_stars(
         Turns end when the light of the wings changes by less than this fraction of its error.
     is_saturated : ndarray of bool, shape (h, w)
         Saturated pixels.
+    with_wings : bool
+        False for the sky alone: the wings stay the earlier ones, and no halos are measured.
 
     Returns
     -------
@@ -265,7 +285,9 @@ def around_stars(
     # What is left beside the models has their errors, too.
     sigma = add_model_errors(error, star_light)
     without_stars = image - star_light
-    wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
+    wings = earlier
+    if with_wings:
+        wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
     wing_light = draw_wings(image.shape, stars, wings)
     # The sky without them, of the same structure, and with its noise map if it has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
@@ -284,6 +306,8 @@ def around_stars(
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
     even_light = float(deviation.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, signal=sky.signal - even_light)
+    if not with_wings:
+        return sky, wing_light, wings, np.zeros_like(wing_light)
     halo_error = subtract_halos(sky.signal, wing_light, sky.bad, sigma, stars, wings, is_saturated)
     return sky, wing_light, wings, halo_error
 
@@ -387,29 +411,34 @@ def measure_halo(
     Halo or None
         None if no two rings that follow each other show a halo.
     """
-    from scipy import ndimage
-
     column, row = np.rint(core[:2]).astype(int)
-    window = tuple(
-        slice(max(at - 256, 0), min(at + 257, size))
-        for at, size in zip((row, column), residual.shape, strict=True)
-    )
-    data, noise, middle = residual[window], sigma[window], core[1::-1].astype(float)
+
+    def cut_window(reach_px: int) -> tuple[slice, ...]:
+        return tuple(
+            slice(max(at - reach_px, 0), min(at + reach_px + 1, size))
+            for at, size in zip((row, column), residual.shape, strict=True)
+        )
+
+    middle, window = core[1::-1].astype(float), cut_window(256)
     # Rings wider by a tenth each; `to_circle` turns ellipses into circles.
     edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
     to_circle = np.eye(2)
-    for _ in range(5):
+    for turn in range(5):
+        data, noise = residual[window], sigma[window]
         offset = np.mgrid[window] - middle[:, None, None]
         round_offset = np.tensordot(to_circle, offset, 1)
         radius = np.hypot(*round_offset)
         ring = np.where(bad[window], 0, np.digitize(radius, edges))
         # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
         numbers = np.setdiff1d(ring, [0, len(edges)])
-        level = ndimage.median(data, ring, numbers)
-        log_radius = np.log(ndimage.mean(radius, ring, numbers))
+        level = label_medians(data, ring, len(edges) + 1)[numbers]
         # The error of a median of n values is 1.25 σ/√n.
-        level_error = 1.25 * ndimage.mean(noise, ring, numbers)
-        level_error /= np.sqrt(np.bincount(ring.ravel())[numbers])
+        pixels, radius_sum, noise_sum = (
+            np.bincount(ring.ravel(), weights)[numbers]
+            for weights in (None, radius.ravel(), noise.ravel())
+        )
+        log_radius = np.log(radius_sum / pixels)
+        level_error = 1.25 * noise_sum / pixels**1.5
         # The halo is the first run of rings that show it: near the core, errors of the model of a
         # fitted star may hide it.
         is_seen = np.append(np.abs(level) > 5.0 * level_error, False)
@@ -443,12 +472,15 @@ def measure_halo(
         along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
         stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
         to_circle = stretch @ to_circle
+        # Where the halo ends is known now: its shape is fitted in a window that is twice as wide,
+        # and its light is drawn out to 256 px in the last turn.
+        window = cut_window(256 if turn >= 3 else min(256, int(2.0 * np.exp(end)) + 8))
     # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, whose
     # variance is 8 times the variance e² of the ring's median. σ² is their mean square minus 7 e²,
     # at least e². Outside of the rings that show the halo, σ is half of the light.
     eighth = np.floor(np.arctan2(*offset) * 4.0 / np.pi).astype(int) % 8
-    parts = numbers[:end_ring, None] * 8 + np.arange(8)
-    uneven = ndimage.median(data - light, ring * 8 + eighth, parts.ravel()).reshape(parts.shape)
+    uneven = label_medians(data - light, ring * 8 + eighth, 8 * len(edges) + 8).reshape(-1, 8)
+    uneven = uneven[numbers[:end_ring]]
     noise_variance = np.square(level_error[:end_ring])
     variance = np.nanmean(np.square(uneven), axis=1) - 7.0 * noise_variance
     ring_error = np.sqrt(np.maximum(variance, noise_variance))

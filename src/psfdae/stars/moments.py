@@ -29,6 +29,25 @@ def robust_scatter(values: np.ndarray) -> np.ndarray:
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
 
+def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
+    """Return the medians of the values with each label 0 … `count` − 1, NaN where there is none.
+
+    Parameters
+    ----------
+    values, label : ndarray, shape (…)
+        Numbers, and the label of each, a whole number from 0 to at most 32,767.
+    count : int
+        Number of labels.
+    """
+    # Small whole numbers are sorted by digits, in a fraction of the time of sorting the values.
+    label = label.ravel().astype(np.int16)
+    groups = np.split(
+        values.ravel()[np.argsort(label, kind="stable")],
+        np.cumsum(np.bincount(label, minlength=count))[: count - 1],
+    )
+    return np.array([np.median(group) if group.size else np.nan for group in groups])
+
+
 def count_step(values: np.ndarray) -> float:
     """Return the quantisation step of pixels (m, n), if it is above a tenth of their scatter.
 

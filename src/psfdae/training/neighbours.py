@@ -15,14 +15,18 @@ from functools import cached_property
 import numpy as np
 
 from psfdae.base.errors import Error
+from psfdae.base.threads import fix_threads
 from psfdae.image.image import Image
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut_image
-from psfdae.methods.field import FieldMixture
+from psfdae.methods.field import FieldMixture, select_fit_stars
+from psfdae.methods.field.prior import FieldSettings
+from psfdae.methods.field.residuals import MARGIN_PX
+from psfdae.methods.field.search import fit_first_field
+from psfdae.methods.field.spline import FieldModel
 from psfdae.photometry import crowded
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-from psfdae.training.fitting import fit_method
 from psfdae.training.star_residuals import reject_misfits
 from psfdae.training.stars import ImageStars, select_stars
 
@@ -32,38 +36,49 @@ class _Field(FieldPsfs):
 
     Parameters
     ----------
-    method_fit : FieldMixture
+    model : FieldModel
         Fit to the stars without neighbours.
+    list_offset : ndarray, shape (2,)
+        Offset (row, column) of the field's centres from the list, in pixels.
     stamp_px : int
         Side of the stamps that the fit was made of.
     """
 
     name, image_px = "of stars without neighbours", None
 
-    def __init__(self, method_fit: FieldMixture, stamp_px: int) -> None:
-        self.method_fit, self.stamp_px = method_fit, stamp_px
+    def __init__(self, model: FieldModel, list_offset: np.ndarray, stamp_px: int) -> None:
+        self.model, self.list_offset, self.stamp_px = model, list_offset, stamp_px
 
     @property
     def order(self) -> int:
-        return self.method_fit.order
+        return self.model.order
 
     @cached_property
     def sha256(self) -> str:
-        return hashlib.sha256(self.method_fit.coefficients.tobytes()).hexdigest()
+        return hashlib.sha256(self.model.coefficients.tobytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.method_fit.low[:2], self.method_fit.high[:2]
-
-    @property
-    def magnitude_range(self) -> tuple[float, float] | None:
-        low, high = self.method_fit.low.tolist(), self.method_fit.high.tolist()
-        return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
+        return self.model.low[:2], self.model.high[:2]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Accept any scale: the fit is used on its own image."""
 
     def draw_psfs(self, position: np.ndarray, oversampling: int) -> np.ndarray:
-        return self.method_fit.psf_at(position, oversampling)
+        terms = self.model.terms(position)
+        return self.model.psfs(terms, position, self.list_offset, self.stamp_px, oversampling)
+
+
+def fit_isolated_stars(stars: ImageStars) -> _Field:
+    """Fit a field to the bright stars of one image, without those that are held out."""
+    settings, bright = stars.settings, stars.candidates.bright.select(~stars.held_out)
+    stamp_px, frame_px = settings.framing.stamp_px, settings.framing.stamp_px + 2 * MARGIN_PX
+    bright = bright.select(select_fit_stars(bright.snr, frame_px**2, settings.seed))
+    field: FieldSettings = FieldMixture.settings(settings)["field"]
+    sky_photons = settings.noise.background_photons
+    with fix_threads(field.threads):
+        _, fit = fit_first_field(bright, sky_photons, frame_px, stamp_px, field)
+    # The offset from the list is unknown without a list, or with few stars.
+    return _Field(fit.model, np.nan_to_num(fit.list_error(bright)[0]), stamp_px)
 
 
 def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars:
@@ -93,9 +108,11 @@ def subtract_neighbours(stars: ImageStars, neighbour_ratio: float) -> ImageStars
     for _ in range(2 if accepted_ratio > neighbour_ratio else 1):
         # A field from the stars so far, photometry of all stars with it, and a new choice of
         # bright stars in the cleaned image.
-        field = _Field(fit_method(stars, FieldMixture), settings.framing.stamp_px)
+        field = fit_isolated_stars(stars)
         try:
-            photometry = crowded.photometry(field, observation)
+            # Stars that are hidden in the light of others are searched for once; wings are far
+            # wider than a stamp, whose own sky is measured.
+            photometry = crowded.photometry(field, observation, turns=3, with_wings=False)
             # Within 1.25 FWHM, the light of two stars cannot be separated well enough.
             isolation_px = 1.25 * field.fwhm_px()
             light = draw_other_stars(photometry, observation.positions)

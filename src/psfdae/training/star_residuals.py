@@ -14,10 +14,9 @@ import numpy as np
 from psfdae.image.selection import Candidates, Verdict
 from psfdae.image.stamps import cut
 from psfdae.methods.field import select_fit_stars
-from psfdae.methods.field.fit import FieldFitter
 from psfdae.methods.field.prior import FieldSettings
 from psfdae.methods.field.residuals import MARGIN_PX
-from psfdae.methods.field.search import fit_field
+from psfdae.methods.field.search import fit_first_field
 from psfdae.training.settings import Settings
 
 
@@ -53,12 +52,9 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
     frame_px = side + 2 * MARGIN_PX
     rows = select_fit_stars(bright.snr, frame_px**2, settings.seed)
     stars, field = bright.select(rows), getattr(settings, "field", None) or FieldSettings()
-    # The highest order, up to 4, of which each of the (o + 1)(o + 2)/2 terms has four stars.
-    order = max(o for o in range(5) if o == 0 or 2 * (o + 1) * (o + 2) <= len(stars))
     photons = stars.sky_photons(gain, settings.noise.background_photons)
-    fit = fit_field(stars, photons, frame_px, side, [order], field.spacing_px, field.smoothness)
+    fitter, fit = fit_first_field(stars, photons, frame_px, side, field)
     # Light of the fitted stars, and variance; 0 where nothing was measured.
-    fitter = FieldFitter.build(stars, photons, frame_px, side)
     light = np.where(fitter.is_valid, fitter.images / fit.flux[:, None, None] - fit.residual, 0.0)
     variance = np.where(fitter.is_valid, fitter.pixel_variance(fit.flux, light), 0.0)
     light, variance, residual = (cut(a, side) for a in (light.clip(0.0), variance, fit.residual))

@@ -32,7 +32,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.photometry import crowded
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.training.fitting import fit_method
-from psfdae.training.neighbours import _Field
+from psfdae.training.neighbours import fit_isolated_stars
 from small_field import CAMERA, SKY, drawn, moffat, noisy
 
 SIDE = 320
@@ -623,7 +623,7 @@ def test_nothing_depends_on_the_unit(clean, unit):
     results = []
     for pixels in (image, image * unit):
         stars = Stars.from_image(pixels, detect=True)
-        model = _Field(fit_method(stars, FieldMixture), 16)
+        model = fit_isolated_stars(stars)
         results.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
     (first_stars, first, table), (second_stars, second, scaled) = results
     assert (first_stars.candidates.verdict == second_stars.candidates.verdict).all()

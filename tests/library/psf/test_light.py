@@ -61,7 +61,7 @@ def bright_field(request):
     # Nothing is tried: one order alone.
     settings = FieldSettings(orders=[0], spacing_px=knots_px)
     fitted = FieldMixture.fit(stars.training_set(FieldMixture), field=settings)
-    return neighbours._Field(fitted, 16), stars, flux, profile
+    return neighbours._Field(fitted.model, fitted.list_offset, 16), stars, flux, profile
 
 
 def test_psfs_have_the_same_light_at_every_phase(bright_field, tmp_path):

@@ -213,12 +213,7 @@ class FieldPrior:
             PSFs; m as in `FieldModel.images`.
         """
         terms = self.terms(position)[0]
-        # The phase of (row, column) in a pixel, in the coordinates of the field's centres.
-        phase = (position - np.floor(position + 0.5))[:, 1::-1]
-        images = self.model.images(terms, phase + self.list_offset, self.side, oversampling)
-        centre = np.broadcast_to(self.list_offset, phase.shape)
-        total = self.model.images(terms, centre, self.side).sum(axis=(1, 2), keepdims=True)
-        return np.asarray(images / total)
+        return self.model.psfs(terms, position, self.list_offset, self.side, oversampling)
 
     def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Yield conditions that any fit fulfils: a mean star of sum 1, and smaller residuals.

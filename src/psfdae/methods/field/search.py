@@ -7,20 +7,22 @@ brightness of a star, and through lenses and atmosphere with its colour. Magnitu
 are two additional terms if they clearly improve the prediction, and likewise the colour.
 
 `fit_field` fits the stars of an image, and `refit_field` the stars of another exposure of its
-field; both return a `FieldFit`.
+field. `fit_first_field` compares no options: it finds stars unlike the others, and the light of
+neighbours. All return a `FieldFit`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
 from psfdae.base.progress import task
 from psfdae.methods.field.errors import field_uncertainty, left_out_error
 from psfdae.methods.field.fit import FieldFit, FieldFitter, FitOptions, FitSettings
+from psfdae.methods.field.prior import FieldSettings
 from psfdae.methods.field.spline import FieldModel, compute_spacing, count_knots
 from psfdae.stars.bright_stars import BrightStars
 
@@ -82,6 +84,42 @@ def fit_field(
         return fit._replace(uncertainty=field_uncertainty(fitter, fit, rng))
 
 
+def fit_first_field(
+    stars: BrightStars, background: float, frame_px: int, stamp_px: int, settings: FieldSettings
+) -> tuple[FieldFitter, FieldFit]:
+    """Fit the field with one set of options, in a fraction of the time of `fit_field`.
+
+    The polynomial has the highest order, up to 4, of which each of the (o + 1)(o + 2)/2 terms has
+    four stars.
+
+    Parameters
+    ----------
+    stars : BrightStars
+        Stars of the fit, all of which have positions.
+    background : float
+        Sky in photons per pixel.
+    frame_px, stamp_px : int
+        Side of the fitted frames, and of the stamps in which stars have flux 1.
+    settings : FieldSettings
+        Minimum distance of the knots, and smoothness.
+
+    Returns
+    -------
+    fitter : FieldFitter
+        The stars in their frames.
+    fit : FieldFit
+        Model of the field, without its uncertainty.
+    """
+    fitter = FieldFitter.build(stars, background, frame_px, stamp_px)
+    order = max(o for o in range(5) if o == 0 or 2 * (o + 1) * (o + 2) <= len(stars))
+    # Cubic splines with knots 0.7 σ apart follow a Gaussian of that σ to 0.2 % of its peak. The
+    # noise-equivalent area of a star is A = 4πσ². Rings are finer than that.
+    sigma_px = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
+    spacing = np.clip(0.7 * sigma_px, settings.spacing_px, 2.0 * settings.spacing_px)
+    knots = count_knots(frame_px, float(spacing))
+    return fitter, fitter.fit(FitOptions(knots, settings.smoothness, order))
+
+
 def _search_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int]) -> FitOptions:
     """Return the options with which left-out stars are predicted best.
 
@@ -95,6 +133,7 @@ def _search_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[i
         Orders of the polynomial, ascending.
     """
 
+    @cache
     def compute_error(options: FitOptions) -> float:
         return left_out_error(fitter, fitter.fit(options))
 
