@@ -12,7 +12,7 @@ they may show a neighbour. `psfdae.methods.field.search` chooses the options by 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -50,7 +50,8 @@ class FitOptions:
     change : float
         Relative standard deviation of a coefficient about its value in another exposure.
     tolerance : float
-        Residual at which the conjugate gradients stop (`FitSettings.compared_tolerance`).
+        Residual at which the conjugate gradients stop in the last round, relative to the right-hand
+        side. 3e-4 leaves a χ² that is about 0.3 above its minimum.
     """
 
     knots: int
@@ -58,7 +59,7 @@ class FitOptions:
     order: int
     star_terms: tuple[int, ...] = ()
     change: float = 0.0
-    tolerance: float = 1e-4
+    tolerance: float = 3e-4
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,9 @@ class FitSettings:
     compared_tolerance : float
         `FitOptions.tolerance` of fits that are only compared: up to it, errors of left-out stars
         hardly change.
+    early_tolerance : float
+        Least tolerance of all rounds but the last. With 3e-3, a star whose pixels are off by 3 %
+        is not seen among 40 stars.
     """
 
     rounds: int = 3
@@ -117,6 +121,7 @@ class FitSettings:
     enough_stars: int = 300
     few_stars: int = 16
     compared_tolerance: float = 3e-3
+    early_tolerance: float = 1e-3
 
 
 class FieldUncertainty(NamedTuple):
@@ -286,13 +291,21 @@ class FieldFitter:
         light = np.median(self.images / flux[:, None, None], axis=0)
         robust_weight, pixel_weight = np.ones(self.images.shape), self.pixel_weight(flux, light)
         coefficients: np.ndarray | None = None
+        # Centres and weights of the last round are still to come: the others need less accuracy.
+        early = replace(options, tolerance=max(options.tolerance, settings.early_tolerance))
         for turn in range(settings.rounds):
             # Splines at given centres and fluxes (eq. 2), then centres and fluxes at given splines
             # (eq. 4).
             data = self.images / flux[:, None, None]
             weight = pixel_weight * robust_weight
+            is_last = turn == settings.rounds - 1
             coefficients = self.fit_splines(
-                options, terms, data, weight * good[:, None, None], centre, coefficients
+                options if is_last else early,
+                terms,
+                data,
+                weight * good[:, None, None],
+                centre,
+                coefficients,
             )
             splines = np.tensordot(terms, coefficients, 1)
             factor, centre, _ = adjust_stars(
