@@ -50,7 +50,7 @@ rule own_stars:
     shell:
         "psfdae train {input.image} --config {params.config} --name example"
         " --catalogue {input.catalogue} --licence MIT --overwrite --out {params.folder}"
-        " > {log} 2>&1"
+        " --report {params.folder}/report.html > {log} 2>&1"
 
 
 rule from_stars_example:

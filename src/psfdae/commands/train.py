@@ -400,9 +400,9 @@ def write_model(
         report = validate(model, stars, all_fits)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.photometry.columns, digits=6)
-        write_bytes(files.path / "report.png", report.strip_png)
         if page is not None:
             print(f"writing {page}")
+            write_bytes(files.path / "report.png", report.strip_png)
             report.save(page)
     return str(report)
 
