@@ -373,11 +373,16 @@ def fill_bad_pixels(
     # In the second pass, the bad pixels of neighbours are filled, too.
     for _ in range(2):
         aligned_stamps, images = stars.align(), stars.stamps.copy()
-        for star, neighbours in zip(incomplete, nearest, strict=True):
-            # Median of the neighbours, moved to the star's centre; its flux by least squares over
-            # the good pixels of the stamp, F = Σ x p / Σ p².
-            psf = np.median(aligned_stamps[neighbours[neighbours != star]], axis=0)
-            psf = shift_stamps(psf[None], stars.centre[star][None])[0]
+        # Median of the neighbours, moved to the star's centre; its flux by least squares over the
+        # good pixels of the stamp, F = Σ x p / Σ p².
+        medians = np.stack(
+            [
+                np.median(aligned_stamps[neighbours[neighbours != star]], axis=0)
+                for star, neighbours in zip(incomplete, nearest, strict=True)
+            ]
+        )
+        psfs = shift_stamps(medians, stars.centre[incomplete])
+        for star, psf in zip(incomplete, psfs, strict=True):
             bad = stars.bad[star]
             is_good = ~bad[stamp]
             square = float(np.square(psf[stamp][is_good]).sum())

@@ -251,10 +251,11 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
     sample = np.s_[:: max(1, len(x) // 5000)]
     for angle in np.deg2rad(np.arange(0.0, 180.0, 0.5)):
         across = Line(float(angle), 0.0).across(x[sample], y[sample])
-        count, edge = np.histogram(across, max(1, int(np.ptp(across) / 2.0)))
+        least = float(across.min())
+        count = np.bincount(((across - least) / 2.0).astype(int))
         if count.max() > most_pixels:
             most_pixels = int(count.max())
-            line = Line(float(angle), float(edge[count.argmax()]) + 1.0)
+            line = Line(float(angle), least + 2.0 * float(count.argmax()) + 1.0)
     # Least squares on the pixels nearby: offset and slope along the line.
     for reach_px in (5.0, 3.0, 3.0):
         across, along = line.across(x, y), line.along(x, y)
