@@ -12,6 +12,7 @@ import pty
 import re
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -270,6 +271,19 @@ def test_progress_is_a_bar_in_a_terminal(monkeypatch):
     assert {31, 56, 81, 100} <= {*percents}
     assert shown.count("inner") > 3
     assert shown.count("100%") >= 2
+
+
+def test_a_bar_appears_before_the_first_step_has_ended(monkeypatch):
+    """Of a task whose first step is long, the bar shows that something happens."""
+    error = io.StringIO()
+    error.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", error)
+    shown = threading.Event()
+    write = error.write
+    monkeypatch.setattr(error, "write", lambda text: (shown.set(), write(text)), raising=False)
+    with progress.use_display(bar), progress.task("image", 2):
+        assert shown.wait(60.0)
+    assert "image" in error.getvalue()
 
 
 def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):

@@ -11,13 +11,17 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing import parent_process
+from threading import Lock, Timer
 
 from psfdae.base.progress import Show
 
 
 @contextmanager
 def bar(name: str) -> Iterator[Show]:
-    """Show a task as a bar of click's after its first second; without a terminal, show nothing."""
+    """Show a task as a bar of click's after its first second; without a terminal, show nothing.
+
+    The bar appears even if no step of the task has ended by then.
+    """
     if not sys.stderr.isatty() or parent_process() is not None:
         yield lambda fraction, text: None
         return
@@ -29,22 +33,39 @@ def bar(name: str) -> Iterator[Show]:
     progress_bar = click.progressbar(
         length=length, label=name, file=sys.stderr, item_show_func=lambda text: text or None
     )
+    lock = Lock()
     with ExitStack() as stack:
 
-        def show(fraction: float, text: str) -> None:
+        def begin() -> None:
             nonlocal is_shown
-            # It begins to be drawn when a second has passed, as of the start: the time that is
-            # left follows from it.
-            if not is_shown and time.time() > start + 1.0:
-                stack.enter_context(progress_bar)
-                progress_bar.start = progress_bar.last_eta = start
-                is_shown = True
-            if is_shown:
-                # Two parts of one step both begin at 0: the bar never goes back.
-                steps = max(round(length * fraction) - progress_bar.pos, 0)
-                progress_bar.update(steps, text)
+            # The time that is left follows from the start of the task.
+            stack.enter_context(progress_bar)
+            progress_bar.start = progress_bar.last_eta = start
+            is_shown = True
 
-        yield show
+        def begin_late() -> None:
+            with lock:
+                if not is_shown:
+                    begin()
+
+        def show(fraction: float, text: str) -> None:
+            with lock:
+                if not is_shown and time.time() > start + 1.0:
+                    begin()
+                if is_shown:
+                    # Two parts of one step both begin at 0: the bar never goes back.
+                    steps = max(round(length * fraction) - progress_bar.pos, 0)
+                    progress_bar.update(steps, text)
+
+        timer = Timer(1.0, begin_late)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield show
+        finally:
+            timer.cancel()
+            with lock:  # a timer that has fired has ended
+                pass
 
 
 @contextmanager
