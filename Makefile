@@ -4,9 +4,9 @@
 #   SET="a.b=1 …"    Hydra overrides for every dataset
 #   RESULTS=folder   of this run, whose PRESET and SET it keeps (default: results, or results/PRESET)
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
-#   IMAGES="…"       images of `make night`: a pattern such as night/*.fits, or a CSV list
+#   IMAGES="…"       of `make night`, a pattern or a CSV list; FITS files of `make benchmark TARGETS=images`
 #   FILE=run.tar     archive of a run that `make archive` writes and `make fetch` unpacks
-#   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
+#   AGAINST=commit   that `make benchmark TARGETS=run` or TARGETS=images compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
 #   TRACK=live       shows trainings in MLflow while they run (default: once they are finished)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
@@ -56,14 +56,15 @@ env: .venv/.complete ## Create the environment .venv from the lock file
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
 	@sh workflow/reproduce.sh $(SNAKEMAKE)
 
-benchmark: env ## Run time against error, on a quiet machine; TARGETS=run AGAINST=commit: that of a whole run
+benchmark: env ## Time against error, on a quiet machine; TARGETS=run AGAINST=commit: of a run; TARGETS=images
 stability: env ## Stress tests of the whole chain
 bounds: env ## How far each method is from the best possible one
 bundles: env ## Pack each dataset's network as a model that psfdae predict takes
 benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
-	*) $(LOCKED) -- $@;; esac
+	"benchmark images") python workflow/benchmarks/images.py $$IMAGES --against "$$AGAINST" \
+	  --out "$$PSFDAE_RESULTS/tables/benchmark_images.csv";; *) $(LOCKED) -- $@;; esac
 night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list of images
 	@$(LOCKED) images="$$IMAGES" -- night
 
@@ -109,7 +110,6 @@ test-docs: env ## Every command of README and docs as it is written
 	pytest -m written
 test-pythons: env ## The fast tests with other Pythons, and the newest or lowest versions of dependencies
 	sh tests/pythons.sh $(FAST_TESTS)
-
 dist: env ## Build the source distribution and the wheel in dist/
 	uv build --no-build-isolation --python .venv/bin/python --out-dir dist
 lock: env ## Renew the lock files from pyproject.toml and requirements; torch's CPU builds from TORCH_INDEX
