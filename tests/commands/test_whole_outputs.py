@@ -286,6 +286,24 @@ def test_a_full_disk_at_any_output_is_one_line(inputs, expected):
     assert number > 1
 
 
+@pytest.mark.parametrize("step", ["fit_method", "pack_model", "validate"])
+def test_a_training_that_is_interrupted_leaves_nothing(inputs, monkeypatch, step):
+    """Ctrl-C at any step removes the files that the run has written, and no others."""
+    out, older = inputs / "out", inputs / "out" / "m" / "notes.txt"
+    (inputs / "out").mkdir(exist_ok=True)
+    clear(out)
+    older.parent.mkdir()
+    older.write_text("kept")
+
+    def interrupt(*_, **__):
+        assert len(contents(out)) > 1
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, step, interrupt)
+    assert psfdae(*commands(inputs)["train"]).exit_code == 1
+    assert [path for path in out.rglob("*") if path.is_file()] == [older]
+
+
 @pytest.mark.parametrize("expected", ["photometry", "predict", "psf"], indirect=True)
 def test_a_command_without_space_writes_nothing(inputs, expected):
     """The kernel limits the size, whichever library writes."""

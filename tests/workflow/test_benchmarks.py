@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
+import click
 import numpy as np
 import pytest
 
 import costs
+import images
 import propagators
 import scenes
 from psfdae.optics.propagation import StampPropagator
@@ -62,3 +66,25 @@ def test_knee_is_the_last_training_whose_time_is_worth_its_error():
     """Twice the time must lower the error by a tenth, or four times by a fifth."""
     # From 2 s to 4 s it falls by 6 % only.
     assert costs.knee(np.array([1.0, 2.0, 4.0, 8.0]), np.array([1.0, 0.8, 0.75, 0.7])) == 1
+
+
+# Images
+
+
+def test_the_cost_of_a_command_is_its_own(tmp_path):
+    """Memory and CPU time of a process that takes 200 MB; a failure ends with what it printed."""
+    program = "import time; block = bytearray(200_000_000); time.sleep(0.3)"
+    cost = images.measure_process([sys.executable, "-c", program], tmp_path, {})
+    assert 190 < cost["peak_mb"] < 260 and 0.0 < cost["cpu_s"] < 5.0
+    with pytest.raises(click.ClickException, match="no such tool"):
+        failure = "raise SystemExit('no such tool')"
+        images.measure_process([sys.executable, "-c", failure], tmp_path, {})
+
+
+def test_an_earlier_commit_has_the_name_that_its_command_had(tmp_path):
+    (tmp_path / "new/src/psfdae/commands").mkdir(parents=True)
+    (tmp_path / "new/src/psfdae/commands/train.py").touch()
+    trees = {"now": tmp_path / "new", "earlier": tmp_path / "old"}
+    runs = [*images.list_runs(tmp_path / "i.fits", trees, tmp_path)]
+    names = {tool: words[3] for tool, step, words, _ in runs if step == "train" and tool in trees}
+    assert names == {"now": "train", "earlier": "from-stars"}

@@ -284,6 +284,8 @@ def reserve_folder(
 ) -> Iterator[None]:
     """Refuse outputs that are inputs or exist, and hold the folder, before anything is computed.
 
+    Outputs of a run that Ctrl-C interrupts are removed.
+
     Raises
     ------
     OutputError, FolderError
@@ -305,7 +307,15 @@ def reserve_folder(
         bundles = sorted(files.path.glob(f"*{SUFFIX}"))
         if bundles and not overwrite:
             raise FolderError(f"{bundles[0]}: a model is there already; --overwrite replaces it")
-        yield
+        outputs = [path for path in (*files.paths(), *lists, page) if path is not None]
+        new_outputs = [path for path in outputs if not path.exists()]
+        try:
+            yield
+        except KeyboardInterrupt:
+            # Ctrl-C leaves nothing but the state of a network, from which its training goes on.
+            for path in new_outputs:
+                path.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
