@@ -19,7 +19,7 @@ from psfdae.base.threads import fix_threads
 from psfdae.image.image import Image
 from psfdae.image.selection import collect
 from psfdae.image.stamps import cut_image
-from psfdae.methods.field import FieldMixture, select_fit_stars
+from psfdae.methods.field import select_fit_stars
 from psfdae.methods.field.prior import FieldSettings
 from psfdae.methods.field.residuals import MARGIN_PX
 from psfdae.methods.field.search import fit_first_field
@@ -73,7 +73,7 @@ def fit_isolated_stars(stars: ImageStars) -> _Field:
     settings, bright = stars.settings, stars.candidates.bright.select(~stars.held_out)
     stamp_px, frame_px = settings.framing.stamp_px, settings.framing.stamp_px + 2 * MARGIN_PX
     bright = bright.select(select_fit_stars(bright.snr, frame_px**2, settings.seed))
-    field: FieldSettings = FieldMixture.settings(settings)["field"]
+    field = getattr(settings, "field", None) or FieldSettings()
     sky_photons = settings.noise.background_photons
     with fix_threads(field.threads):
         _, fit = fit_first_field(bright, sky_photons, frame_px, stamp_px, field)
