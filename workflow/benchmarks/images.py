@@ -110,10 +110,14 @@ def compare_tools(image: tuple[Path, ...], against: str, out: Path) -> None:
         for label, size in FIELDS.items():
             words = [sys.executable, "-c", SIMULATE, folder / f"{label}.fits", *size]
             subprocess.run([*map(str, words)], check=True)
-        for path in (*(folder / f"{label}.fits" for label in FIELDS), *image):
-            for tool, step, words, environment in list_runs(path.resolve(), trees, folder):
+        paths = (*(folder / f"{label}.fits" for label in FIELDS), *image)
+        for number, path in enumerate(paths):
+            # Images of different folders may have the same name.
+            place = folder / f"image{number}"
+            place.mkdir()
+            for tool, step, words, environment in list_runs(path.resolve(), trees, place):
                 row = {"image": path.stem, "tool": tool, "step": step}
-                rows.append(row | measure_process(words, folder, environment))
+                rows.append(row | measure_process(words, place, environment))
                 print(*rows[-1].values(), flush=True)
                 # Written after each run, so that an interruption loses none.
                 lines = [",".join(map(str, line.values())) for line in rows]

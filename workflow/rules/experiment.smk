@@ -16,7 +16,8 @@ rule experiment_table:
         experiment=RUN.experiment or "none",
     localrule: True
     params:
-        variants=lambda w: [variant.name for variant in RUN.variants],
+        # The name of a variant does not depend on the name of its setting, which is in the table.
+        settings=lambda w: [f"{v.setting}={v.name}" for v in RUN.variants],
         given=lambda w: [f"--override={word}" for word in RUN.overrides],
         source=hash_code("experiment"),
         folder=subpath(output.table, parent=True),

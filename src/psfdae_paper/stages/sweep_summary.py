@@ -25,7 +25,7 @@ from psfdae_paper.configuration.sweep import Sweep
 from psfdae_paper.sweeps.figures import draw_sweep
 from psfdae_paper.sweeps.measurement import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
-from psfdae_paper.sweeps.study import create_study, open_journal
+from psfdae_paper.sweeps.study import create_study, read_study
 
 
 @command("paper sweep summary")
@@ -199,7 +199,4 @@ def sweep_figure(
     out : Path
         PNG.
     """
-    from optuna import load_study
-
-    points = load_study(study_name=None, storage=open_journal(study))
-    write_png(draw_sweep(points, kind), out)
+    write_png(draw_sweep(read_study(study), kind), out)

@@ -39,9 +39,9 @@ def draw_sweep(study: Study, kind: str) -> Figure:
     kind : str
         parallel: a line for each point over all axes; response: the metric against each axis;
         contours: the metric over each pair of axes; importance: share of each axis in the variance
-        of the metric's logarithm that single axes explain, by functional analysis of variance
-        (fANOVA; Hutter et al. 2014, *An efficient approach for assessing hyperparameter
-        importance*).
+        of the logarithm of the error (the metric, or 1 − SSIM) that single axes explain, by
+        functional analysis of variance (fANOVA; Hutter et al. 2014, *An efficient approach for
+        assessing hyperparameter importance*).
     """
     import matplotlib.pyplot as plt
     from matplotlib.text import Text
@@ -61,8 +61,9 @@ def draw_sweep(study: Study, kind: str) -> Figure:
         "importance": plots.plot_param_importances,
     }
     if kind == "importance":
-        # Relative changes count, as in the geometric mean over noise levels.
-        values["target"] = lambda trial: math.log(trial.value)
+        # Relative changes of errors count, as in the geometric mean over noise levels.
+        is_ssim = metric == "validation_ssim"
+        values["target"] = lambda trial: math.log(1.0 - trial.value if is_ssim else trial.value)
         values["evaluator"] = FanovaImportanceEvaluator(seed=0)
         # Equal metrics have no variance: no bar is drawn.
         if len({trial.value for trial in study.trials} - {None}) < 2:
@@ -91,8 +92,9 @@ def draw_sweep(study: Study, kind: str) -> Figure:
             panel.tick_params("x", which="both", labelrotation=30)
             panel.label_outer()
     if kind == "importance":
+        error = f"1 − {label}" if is_ssim else label
         panels[0].set(
-            xlabel=f"share of the variance of ln({label}) explained by single axes", ylabel=""
+            xlabel=f"share of the variance of ln({error}) explained by single axes", ylabel=""
         )
         panels[0].get_legend().remove()
     failed_count = len(study.get_trials(deepcopy=False, states=[TrialState.FAIL]))

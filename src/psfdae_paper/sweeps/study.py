@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from psfdae.base.files import ProductError
 from psfdae.base.rng import stream
 from psfdae_paper.configuration.sweep import Axis, Sweep, Value
 
@@ -89,6 +90,25 @@ def open_journal(path: Path) -> JournalStorage:
     from optuna.storages.journal import JournalFileBackend
 
     return JournalStorage(JournalFileBackend(str(path)))
+
+
+def read_study(path: Path) -> Study:
+    """Read the study of a sweep.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing, or no journal of one study.
+    """
+    import optuna
+
+    # Optuna would make a new file.
+    if not path.is_file():
+        raise ProductError(f"{path}: missing; `psfdae paper sweep summary` writes it")
+    try:
+        return optuna.load_study(study_name=None, storage=open_journal(path))
+    except (ValueError, KeyError):
+        raise ProductError(f"{path}: damaged, or no journal of a study of Optuna") from None
 
 
 def list_values(sweep: Sweep) -> list[dict[str, Value]]:

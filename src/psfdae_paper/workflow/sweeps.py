@@ -8,7 +8,6 @@ from psfdae.methods import method
 from psfdae_paper.configuration.estimators import list_swept_networks
 from psfdae_paper.configuration.sweep import find_sweeps
 from psfdae_paper.source import source_hash
-from psfdae_paper.stages.sweep import training_module
 from psfdae_paper.sweeps.figures import ALL_AXES, TWO_AXES
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
 from psfdae_paper.workflow.datasets import stars_file
@@ -72,6 +71,9 @@ def point_threads(run: Run, wildcards: Wildcards) -> int:
 @cache
 def sweep_code(run: Run, name: str) -> str:
     """Return the hash of a point's code, with the code of its model."""
+    # Imports pandas, for which a run without sweeps would wait.
+    from psfdae_paper.stages.sweep import training_module
+
     sweep = sweep_plan(run, name).sweep
     modules = [] if sweep.model in list_swept_networks() else [method(sweep.model).__module__]
     return source_hash("sweep point", training_module(sweep.model), *modules)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.base.files import Column, write_product
+from psfdae.base.files import Column, ProductError, write_product
 from psfdae.base.reading import read_json
 from psfdae.methods import list_groups
 from psfdae.stars.splits import random_split
@@ -25,7 +25,7 @@ from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps import points
 from psfdae_paper.sweeps.figures import ALL_AXES, TWO_AXES, draw_sweep
 from psfdae_paper.sweeps.measurement import Task
-from psfdae_paper.sweeps.study import open_journal
+from psfdae_paper.sweeps.study import open_journal, read_study
 from psfdae_paper.tracking import find_stars
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
@@ -299,6 +299,33 @@ def test_figures_show_every_point_or_say_why_not(tmp_path, outcomes):
         assert len(drawn) == count and drawn[:, 1].min() == pytest.approx(10)
     has_failed = count < len(outcomes)
     assert figure.get_suptitle().endswith("failed" if has_failed else "points")
+
+
+@pytest.mark.parametrize("content", [None, "", "no journal\n", '{"op_code": 0}\n'])
+def test_a_missing_or_damaged_study_is_named(tmp_path, content):
+    """No new file is made in its place."""
+    path = tmp_path / "study.journal"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ProductError, match=r"study\.journal: (missing|damaged)"):
+        read_study(path)
+    assert path.is_file() == (content is not None)
+
+
+def test_importance_of_negative_similarities_is_drawn(tmp_path):
+    """SSIM may be below 0, where it has no logarithm."""
+    files = write_points(tmp_path, OUTCOMES)
+    for path, value in zip(files, (-0.1, 0.0, None, 0.9), strict=True):
+        result = read_json(path)
+        result["metrics"] = {} if value is None else {"validation_ssim": value}
+        path.write_text(json.dumps(result))
+    sweep = Sweep.model_validate(
+        {**DEFINITION, "metric": "validation_ssim", "direction": "maximize"}
+    )
+    sweep_summary.tabulate_points("tried", sweep, OVERRIDES, files, tmp_path)
+    (panel,) = draw_sweep(read_study(tmp_path / "study.journal"), "importance").axes
+    assert "ln(1 − SSIM)" in panel.get_xlabel()
+    assert sum(bar.get_width() for bar in panel.patches) == pytest.approx(1.0)
 
 
 def test_stars_of_a_point_have_its_settings(tmp_path):
