@@ -69,8 +69,8 @@ stamps = data[row[:, None, None] + axis[:, None], column[:, None, None] + axis]
 PEERS = {
     "epsfbuilder": """
 from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars
-stars = [EPSFStar(s, cutout_center=(a - b + half, c - d + half))
-         for s, a, b, c, d in zip(stamps, x, column, y, row)]
+stars = [EPSFStar(s, cutout_center=(a - b + half, c - d + half), id_label=k + 1)
+         for k, (s, a, b, c, d) in enumerate(zip(stamps, x, column, y, row))]
 EPSFBuilder(oversampling=2, progress_bar=False)(EPSFStars(stars))
 """,
     "piff": """
