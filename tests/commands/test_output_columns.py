@@ -22,7 +22,6 @@ from image_training import few_draws
 from known_wavefronts import SKY, field_of, imaged, sensed, three_terms
 from psfdae import StarFlag, load_model
 from psfdae.base.files import write_csv
-from psfdae.report import validation
 from psfdae.sensing import sampling
 from psfdae.sensing.sampling import Chains
 from psfdae.stars.moments import measure_shapes
@@ -433,7 +432,7 @@ def test_columns_of_the_night(folder, stars, true, model, monkeypatch):
     write_csv(out / "rows.csv", DataFrame([row]))
     monkeypatch.setattr(night, "fit_image", lambda stars, start: model)
     report = SimpleNamespace(save=lambda path: path.write_text(""))
-    monkeypatch.setattr(validation, "validate", lambda model, stars: report)
+    monkeypatch.setattr(night, "validate", lambda model, stars: report)
     night.night_images(out / "rows.csv", out, out / "part.csv")
     night.night_table((out / "part.csv",), out / "night.csv")
     table = Table.from_pandas(read_night(out / "night.csv"))
