@@ -63,7 +63,7 @@ bundles: env ## Pack each dataset's network as a model that psfdae predict takes
 benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
-	"benchmark images") python workflow/benchmarks/images.py $$IMAGES --against "$$AGAINST" \
+	"benchmark images") python workflow/benchmarks/image_costs.py $$IMAGES --against "$$AGAINST" \
 	  --out "$$PSFDAE_RESULTS/tables/benchmark_images.csv";; *) $(LOCKED) -- $@;; esac
 night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list of images
 	@$(LOCKED) images="$$IMAGES" -- night

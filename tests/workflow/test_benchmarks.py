@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import costs
-import images
+import image_costs
 import propagators
 import scenes
 from psfdae.optics.propagation import StampPropagator
@@ -74,17 +74,17 @@ def test_knee_is_the_last_training_whose_time_is_worth_its_error():
 def test_the_cost_of_a_command_is_its_own(tmp_path):
     """Memory and CPU time of a process that takes 200 MB; a failure ends with what it printed."""
     program = "import time; block = bytearray(200_000_000); time.sleep(0.3)"
-    cost = images.measure_process([sys.executable, "-c", program], tmp_path, {})
+    cost = image_costs.measure_process([sys.executable, "-c", program], tmp_path, {})
     assert 190 < cost["peak_mb"] < 260 and 0.0 < cost["cpu_s"] < 5.0
     with pytest.raises(click.ClickException, match="no such tool"):
         failure = "raise SystemExit('no such tool')"
-        images.measure_process([sys.executable, "-c", failure], tmp_path, {})
+        image_costs.measure_process([sys.executable, "-c", failure], tmp_path, {})
 
 
 def test_an_earlier_commit_has_the_name_that_its_command_had(tmp_path):
     (tmp_path / "new/src/psfdae/commands").mkdir(parents=True)
     (tmp_path / "new/src/psfdae/commands/train.py").touch()
     trees = {"now": tmp_path / "new", "earlier": tmp_path / "old"}
-    runs = [*images.list_runs(tmp_path / "i.fits", trees, tmp_path)]
+    runs = [*image_costs.list_runs(tmp_path / "i.fits", trees, tmp_path)]
     names = {tool: words[3] for tool, step, words, _ in runs if step == "train" and tool in trees}
     assert names == {"now": "train", "earlier": "from-stars"}
