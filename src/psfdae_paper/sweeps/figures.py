@@ -50,7 +50,7 @@ def draw_sweep(study: Study, kind: str) -> Figure:
     from optuna.trial import TrialState
 
     plots, metric = visualization.matplotlib, study.user_attrs["metric"]
-    label = LABELS[metric]
+    label, is_ssim = LABELS[metric], metric == "validation_ssim"
     # Mean squared errors in 1e-6.
     unit = 1e6 if metric == "validation_mse" else 1.0
     values: dict[str, Any] = {"target": lambda trial: unit * trial.value, "target_name": label}
@@ -62,7 +62,6 @@ def draw_sweep(study: Study, kind: str) -> Figure:
     }
     if kind == "importance":
         # Relative changes of errors count, as in the geometric mean over noise levels.
-        is_ssim = metric == "validation_ssim"
         values["target"] = lambda trial: math.log(1.0 - trial.value if is_ssim else trial.value)
         values["evaluator"] = FanovaImportanceEvaluator(seed=0)
         # Equal metrics have no variance: no bar is drawn.

@@ -72,10 +72,11 @@ def create_study(
     study.set_user_attr("metric", sweep.metric)
     for result in results:
         # A trial that was stopped early has metrics like one that was trained to its end.
-        value = result["metrics"].get(sweep.metric)
+        value = result["metrics"].get(sweep.metric, math.nan)
+        is_finite = math.isfinite(value)
         trial = create_trial(
-            state=TrialState.FAIL if value is None else TrialState.COMPLETE,
-            value=value,
+            state=TrialState.COMPLETE if is_finite else TrialState.FAIL,
+            value=value if is_finite else None,
             params={key: _to_optuna(result["values"][key]) for key in sweep.space},
             distributions=_list_distributions(sweep),
             user_attrs={"point": result["point"], **result["metrics"]},

@@ -280,6 +280,15 @@ def test_points_without_any_metric_end_in_one_line(tmp_path):
         summarise(tmp_path, failed)
 
 
+def test_a_metric_that_is_not_finite_is_never_the_best(tmp_path):
+    scores = (np.nan, np.inf, -np.inf, 1.0)
+    outcomes = [(*values, new) for (*values, _), new in zip(OUTCOMES, scores, strict=True)]
+    out = summarise(tmp_path, outcomes)
+    assert yaml.safe_load((out / "best.yaml").read_text())["point"] == f"{3:012x}"
+    study = read_study(out / "study.journal")
+    assert [trial.state.name for trial in study.trials] == ["FAIL"] * 3 + ["COMPLETE"]
+
+
 # All but one point failed: Optuna has nothing to compare.
 LONE = [(width, lr, score and None) for width, lr, score in OUTCOMES[:3]] + OUTCOMES[3:]
 
