@@ -641,6 +641,8 @@ def measure_statistics(stars: DrawnStars, levels: np.ndarray, points: int) -> di
         wavefront_mean[[1, 2, 4, 5, 6, 7]] = 0.0
         for pair in ([1, 2], [6, 7]):
             wavefront_sd[pair] = np.sqrt(np.square(wavefront_sd[pair]).mean())
+        # Coordinates that do not vary are standardised to 0.
+        wavefront_sd = np.maximum(wavefront_sd, 1e-3)
     return {
         "mean": mean,
         "axes": axes,

@@ -139,6 +139,8 @@ def draw_experiment(table: pd.DataFrame, name: str) -> Figure:
         for panel, kind in zip(panel_row, methods, strict=True):
             _draw_panel(panel, part_rows[part_rows.method == kind], settings, *columns)
             panel.set_yscale("linear" if has_ratios else "log")
+            # All methods share the axis, also those that this dataset does not have.
+            set_noise_axis(panel, np.unique(part_rows.noise_level))
         panel_row[0].set_ylabel("\n".join(map(str, part)), fontsize=8)
     for panel, kind in zip(panels[0], methods, strict=True):
         panel.set_title(method(kind).look.label.replace(" (", "\n("), fontsize=8)
@@ -155,7 +157,6 @@ def _draw_panel(
     panel: Axes, rows: pd.DataFrame, settings: Sequence[str], column: str, error_column: str
 ) -> None:
     """Draw a line with error bars for each setting against the noise level."""
-    levels = np.unique(rows.noise_level)
     for i, setting in enumerate(settings):
         line = rows[rows.setting == setting]
         # Bars of different settings stand side by side, 1.5 % apart.
@@ -171,5 +172,4 @@ def _draw_panel(
             capsize=2,
             label=setting,
         )
-    set_noise_axis(panel, levels)
     panel.grid(visible=True, which="major")

@@ -89,6 +89,18 @@ def test_new_network_is_the_posterior_mean_of_one_gaussian_mode():
     assert error == pytest.approx(tau**2 * variance / (tau**2 + variance), rel=0.2)
 
 
+def test_coordinates_that_do_not_vary_are_standardised_to_0():
+    """Without random aberrations, all stars have the same spherical aberration."""
+    rng = np.random.default_rng(2)
+    stamps, wavefront = rng.random((50, 8, 8)), rng.standard_normal((50, 8))
+    wavefront[:, 0] = 0.3
+    stars = DrawnStars(stamps.reshape(50, -1), np.zeros((50, 2)), wavefront)
+    statistics = measure_statistics(stars, LEVELS, points=11)
+    scaled = (wavefront - statistics["wavefront_mean"]) / statistics["wavefront_sd"]
+    assert scaled[:, 0] == pytest.approx(0.0, abs=1e-9)
+    assert scaled[:, 3].std() == pytest.approx(1.0)
+
+
 def test_estimates_have_the_sum_1():
     rng = np.random.default_rng(4)
     stamps = rng.random((300, 8, 8))

@@ -225,3 +225,20 @@ def test_the_table_and_the_figure_of_an_experiment_show_all_settings():
     assert line.get_xydata() == pytest.approx(np.array([[1e-3 / 1.015**0.5, 2e-6]]))
     assert bars.get_segments()[0][:, 1] == pytest.approx(2e-6 + np.array([-1, 1]) * 1e-6 / 3**0.5)
     assert "3 seeds of 50 test stars" in figure.get_suptitle()
+
+
+def test_a_method_that_only_one_dataset_has_leaves_a_panel_empty():
+    """Datasets may have other methods; their panels have the levels of the dataset."""
+    variants = [Variant(name, "paper", 1, ("seed=1",)) for name in ("dataset3", "dataset5")]
+    key = {"split": "random", "reference": "realisation", "n": 50, "stderr": 1e-7}
+    rows = [
+        {**key, "dataset": variant.name, "method": kind, "noise_level": level, "metric": "mse"}
+        for variant, kind in ((variants[0], "dae"), (variants[1], "dae"), (variants[0], "gmm"))
+        for level in ((1e-3, 2e-3) if variant.dataset == "dataset3" else (5e-4,))
+    ]
+    table = compare_settings(pd.DataFrame(rows).assign(value=1e-6), variants)
+    figure = draw_experiment(table, "mine")
+    ticks = [panel.get_xticks().tolist() for panel in figure.axes]
+    assert ticks == [[1e-3, 2e-3]] * 2 + [[5e-4]] * 2
+    assert np.isfinite(figure.axes[0].containers[0][0].get_xydata()).all()
+    assert len(figure.axes[3].containers[0][0].get_xydata()) == 0
