@@ -16,7 +16,7 @@ import pandas as pd
 import yaml
 
 from psfdae.base.figures import write_png
-from psfdae.base.files import ProductError, as_yaml, write_bytes, write_csv, write_text
+from psfdae.base.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_json, read_yaml
 from psfdae.base.settings import as_overrides
@@ -25,7 +25,7 @@ from psfdae_paper.configuration.sweep import Sweep
 from psfdae_paper.sweeps.figures import draw_sweep
 from psfdae_paper.sweeps.measurement import read_cost
 from psfdae_paper.sweeps.points import SweepError, plan_sweep
-from psfdae_paper.sweeps.study import create_study, read_study
+from psfdae_paper.sweeps.study import create_study, drop_times, read_study
 
 
 @command("paper sweep summary")
@@ -104,7 +104,7 @@ def tabulate_points(
     with tempfile.TemporaryDirectory() as temporary:
         journal = Path(temporary, "study.journal")
         study = create_study(sweep, results, name=name, journal=journal)
-        write_bytes(out / journal.name, journal.read_bytes())
+        write_text(out / journal.name, drop_times(journal.read_text()))
         # Of equal points, the first is the best; without any metric, the sweep has failed.
         try:
             best_result = results[study.best_trial.number]

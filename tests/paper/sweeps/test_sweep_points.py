@@ -261,8 +261,10 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
 
 def test_study_of_a_sweep_is_readable_by_optuna(tmp_path):
     out = summarise(tmp_path)
-    # Written again, it has no trial twice.
+    # Written again, it has no trial twice, and the same bytes.
+    first = (out / "study.journal").read_bytes()
     summarise(tmp_path)
+    assert (out / "study.journal").read_bytes() == first
     storage = open_journal(out / "study.journal")
     study = optuna.load_study(study_name="tried", storage=storage)
     table = pd.read_csv(out / "summary.csv", dtype={"point": str})
