@@ -21,6 +21,10 @@ from psfdae.base.progress import steps
 from psfdae.base.types import csc_array
 from psfdae.psf.grid import PsfGrid
 
+MOST_SPLINE_BYTES = 2**28
+"""Memory in which the PSFs of all stars are kept during a fit: 14,000 stars in stamps of 16 px, or
+900 in stamps of 64 px."""
+
 
 @dataclass(frozen=True)
 class JointFit:
@@ -201,8 +205,8 @@ class _Fit:
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
         # Places that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_place, self.pull = self.start, 0.0
-        # A star moves so little that its PSF stays as it is at the start.
-        self._splines = psfs.mix_splines(self.start, self.flux)
+        # A star moves so little that its PSF stays as it is at the start, of these fluxes.
+        self._mix_splines()
         self._light = np.empty((len(self.stars), side, side))
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         self._draw(np.arange(len(self.stars)))
@@ -213,6 +217,15 @@ class _Fit:
         row, column = self._middle[:, 1, None] + axis, self._middle[:, 0, None] + axis
         return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
+    def _mix_splines(self) -> None:
+        """Make the PSFs of the stars at the start with their present fluxes.
+
+        If all together take too much memory, they are made again whenever stars are drawn.
+        """
+        self._psf_flux, self._splines = self.flux.copy(), None
+        if len(self.stars) * self.psfs.splines[0].nbytes <= MOST_SPLINE_BYTES:
+            self._splines = self.psfs.mix_splines(self.start, self.flux)
+
     def _draw(self, rows: np.ndarray) -> None:
         """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
         # Of a stamp, the box in its middle decides. 512 stars at a time, for memory.
@@ -220,7 +233,11 @@ class _Fit:
         edge = (side - self.box_px) // 2
         for part in np.array_split(rows, len(rows) // 512 + 1):
             corner = self._middle[part] - side // 2
-            stamps = self.psfs.stamps(self.place[part], corner, side, splines=self._splines[part])
+            if self._splines is None:
+                splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+            else:
+                splines = self._splines[part]
+            stamps = self.psfs.stamps(self.place[part], corner, side, splines=splines)
             self._light[part] = stamps[:, 0]
             self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
@@ -235,7 +252,7 @@ class _Fit:
         self.flux = flux.astype(np.float64)
         # Where the PSF changes with the magnitude, these fluxes determine it from now on.
         if self.psfs.magnitudes.size:
-            self._splines = self.psfs.mix_splines(self.start, self.flux)
+            self._mix_splines()
             self._draw(np.arange(len(flux)))
         self._subtract(np.arange(len(flux)), self.flux)
 

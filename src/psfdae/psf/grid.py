@@ -96,8 +96,9 @@ class PsfGrid:
         flat = self.splines.reshape(len(self.splines), -1)
         mixed = np.empty((len(centre), flat.shape[1]), np.float32)
         share = share.astype(np.float32)
-        # Batches, for memory.
-        for batch in np.array_split(np.arange(len(centre)), len(centre) // 64 + 1):
+        # Batches with 2^21 coefficients of nodes, for memory.
+        count = node.size * flat.shape[1] // 2**21 + 1
+        for batch in np.array_split(np.arange(len(centre)), count):
             mixed[batch] = (share[batch, None] @ flat[node[batch]])[:, 0]
         return mixed.reshape(len(centre), *self.splines.shape[1:])
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 
+from psfdae.photometry import joint_fit
 from psfdae.photometry.joint_fit import _normal_matrix, chains, fit_stars, standard_errors
 from psfdae.psf.grid import PsfGrid
 from psfdae.stars.bright_stars import magnitude
@@ -65,6 +66,25 @@ def test_stars_that_overlap_are_parted_exactly(psfs, unit):
     assert (np.abs(off) < 0.2 * sigma).all()
     assert fit.flags.tolist() == [0, 0, 0, 0, 0, 1]
     assert fit.light == pytest.approx(image, abs=unit)
+
+
+@pytest.mark.parametrize("has_magnitudes", [False, True])
+def test_a_fit_does_not_depend_on_the_psfs_that_memory_holds(psfs, has_magnitudes, monkeypatch):
+    """PSFs of many stars in wide stamps are made again when they are drawn."""
+    grid = psfs
+    if has_magnitudes:
+        layers = np.array([1.0, 1.1, 1.3])[:, None, None, None, None]
+        grid = replace(psfs, psfs=layers * psfs.psfs, magnitudes=np.array([-10.0, -9.0, -8.0]))
+    rng = np.random.default_rng(2)
+    place, flux = rng.uniform(5, 114, (30, 2)), 10 ** rng.uniform(3, 4, 30)
+    image = image_of(psfs, place, flux)
+    start = place + rng.uniform(-0.5, 0.5, place.shape)
+    pixels = image, np.ones(image.shape), np.zeros(image.shape, bool)
+    kept = fit_stars(grid, *pixels, start, None, BOX_PX, FWHM_PX)
+    monkeypatch.setattr(joint_fit, "MOST_SPLINE_BYTES", 0)
+    fit = fit_stars(grid, *pixels, start, None, BOX_PX, FWHM_PX)
+    for name, values in vars(kept).items():
+        np.testing.assert_array_equal(values, getattr(fit, name), err_msg=name)
 
 
 def test_errors_are_those_of_the_noise(psfs):
