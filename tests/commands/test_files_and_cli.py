@@ -40,6 +40,7 @@ from psfdae.base.files import (
     write_text,
 )
 from psfdae.base.reading import read_table
+from psfdae.commands import terminal
 from psfdae.commands.cli import as_click, command_modules, stage
 from psfdae.commands.terminal import bar, bar_or_lines
 
@@ -284,6 +285,27 @@ def test_a_bar_appears_before_the_first_step_has_ended(monkeypatch):
     with progress.use_display(bar), progress.task("image", 2):
         assert shown.wait(60.0)
     assert "image" in error.getvalue()
+
+
+def test_no_bar_is_drawn_after_the_end_of_a_task(monkeypatch):
+    """A timer may fire at the moment when the task ends."""
+    error, timers = io.StringIO(), []
+    error.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", error)
+
+    class LateTimer(threading.Timer):
+        def run(self):
+            timers.append(self)
+            self.finished.wait()
+            time.sleep(0.1)
+            self.function()
+
+    monkeypatch.setattr(terminal, "Timer", LateTimer)
+    with progress.use_display(bar), progress.task("image", 2):
+        pass
+    shown = error.getvalue()
+    timers[0].join()
+    assert error.getvalue() == shown
 
 
 def test_progress_in_a_log_is_a_line_in_ten_seconds(monkeypatch, capsys):

@@ -63,9 +63,9 @@ def bar(name: str) -> Iterator[Show]:
         try:
             yield show
         finally:
+            # A timer that has fired may be about to begin: no bar is drawn after the end of a task.
             timer.cancel()
-            with lock:  # a timer that has fired has ended
-                pass
+            timer.join()
 
 
 @contextmanager
