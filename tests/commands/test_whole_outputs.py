@@ -304,6 +304,20 @@ def test_a_training_that_is_interrupted_leaves_nothing(inputs, monkeypatch, step
     assert [path for path in out.rglob("*") if path.is_file()] == [older]
 
 
+def test_a_model_has_no_picture_of_the_one_that_it_replaces(inputs):
+    """Without a report, the picture of an earlier model is removed."""
+    out = inputs / "out"
+    out.mkdir(exist_ok=True)
+    clear(out)
+    words = commands(inputs)["train"]
+    printed(*words)
+    picture = out / "m" / "report.png"
+    assert picture.exists()
+    without_report = [w for w in words if w not in ("--report", out / "p.html")]
+    printed(*without_report, "--overwrite")
+    assert (out / "m" / "report.csv").exists() and not picture.exists()
+
+
 @pytest.mark.parametrize("expected", ["photometry", "predict", "psf"], indirect=True)
 def test_a_command_without_space_writes_nothing(inputs, expected):
     """The kernel limits the size, whichever library writes."""

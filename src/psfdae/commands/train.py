@@ -410,10 +410,14 @@ def write_model(
         report = validate(model, stars, all_fits)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.photometry.columns, digits=6)
+        picture = files.path / "report.png"
         if page is not None:
             print(f"writing {page}")
-            write_bytes(files.path / "report.png", report.strip_png)
+            write_bytes(picture, report.strip_png)
             report.save(page)
+    # A picture that an earlier run left would show another model.
+    if page is None:
+        picture.unlink(missing_ok=True)
     return str(report)
 
 
