@@ -12,7 +12,7 @@ import numpy as np
 class Rows:
     """Base of dataclasses whose fields have a row for each item.
 
-    A field is an array, another such object, or None.
+    A field is an array, and for `select` and `split` may also be another such object, or None.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
