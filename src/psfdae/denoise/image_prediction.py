@@ -77,7 +77,7 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
     if model.info.source == "stars":
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assume_scale()
-    statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} states it)"
+    statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} sets it)"
     scale_note = statement if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{scale_note}")
     if fixed and not (model.method.knows_field and isinstance(observation, Image)):

@@ -363,7 +363,7 @@ class StarModel(FieldPsfs):
         if pixel_scale_arcsec is None:
             raise PredictionError(
                 f"{source}: neither a WCS nor the header gives the pixel scale; "
-                f"state it with {keyword('pixel_scale_arcsec')} (the model's is {model_scale:.6g} "
+                f"set it with {keyword('pixel_scale_arcsec')} (the model's is {model_scale:.6g} "
                 f"arcsec){advice}"
             )
         if not abs(pixel_scale_arcsec / model_scale - 1.0) <= SCALE_TOLERANCE:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
-import pandas as pd
 
 from psfdae.base.errors import Error
 from psfdae.base.figures import write_png
@@ -38,7 +37,6 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.evaluation.figures import FieldOfPsfs, draw_field
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import (
     ExampleField,
@@ -56,6 +54,9 @@ from psfdae_paper.stars.nights import (
     simulate_reference_stars,
 )
 from psfdae_paper.stars.scenes import template_wavefronts
+
+if TYPE_CHECKING:
+    from psfdae_paper.evaluation.figures import FieldOfPsfs
 
 ENOUGH_LIGHT = 0.8
 """Fraction of the light that a stamp has to hold, unless there is a warning."""
@@ -147,6 +148,9 @@ def figure_telescope(templates: File, table: File, out: File) -> None:
     out : Path
         PNG.
     """
+    # `psfdae example` runs without pandas, which figures and tables need.
+    from psfdae_paper.evaluation.figures import draw_field
+
     # Table and figure of the same measurements, angles in degrees.
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
@@ -170,6 +174,10 @@ def measure_fields(product: Product) -> FieldOfPsfs:
         PSFs (F, d, d) with the light of each inside its stamp, FWHM in arcsec, ellipticity, and
         position angle in degrees.
     """
+    import pandas as pd
+
+    from psfdae_paper.evaluation.figures import FieldOfPsfs
+
     psf, (x, y) = cut_margin(product), np.rad2deg(product["field"]).T
     shapes = measure_shapes(psf)
     columns = {
@@ -437,6 +445,8 @@ def example_night(
     exposures : int
         Images.
     """
+    import pandas as pd
+
     recipe, reference = NightRecipe(exposures=exposures), out / "reference.csv"
     stars = simulate_reference_stars(recipe, seed)
     write_csv(reference, stars["ra", "dec", "mag"].to_pandas(), digits=9)
