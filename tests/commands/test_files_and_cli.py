@@ -406,6 +406,18 @@ def test_a_mistyped_command_and_options_of_hydra_are_answered(words, message):
     assert re.search(f"Error: {message}".replace("?", r"\?"), result.output), result.output
 
 
+@pytest.mark.parametrize("name", ["predict", "nonsense"])
+def test_the_configuration_of_a_stage_without_one_lists_the_stages_that_have_one(name):
+    """Each listed stage is accepted: commands that read no configuration are not listed."""
+    result = psfdae("paper", "config", "--stage", name)
+    assert result.exit_code == 2
+    message = f"Invalid value for --stage: '{name}' reads no configuration; stages that do: "
+    listed = result.output.split(message)[1].strip().split(", ")
+    assert {"paper fit", "paper config", "simulate"} < {*listed}
+    assert all(stage(command).stage.settings is not None for command in listed)
+    assert not {"predict", "photometry", "validate"} & {*listed}
+
+
 def test_the_help_lists_the_calls_of_python_and_the_stages_below_paper():
     """A user's commands are verbs of Python's calls; the workflow's are one group."""
     output = printed("--help")

@@ -1,7 +1,7 @@
 """Prediction of the stars of an image, for the command `predict` and for `psfdae.PsfModel`.
 
 Inputs: a model, and an image with its star list. Outputs: predictions of all stars, an observation
-whose pixels have the model's scale, and sentences on what limits the trust in the predictions.
+whose pixels have the model's scale, and warnings about limits of the predictions.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CAUSES = "an image that is turned, of another part of the detector, or of anothe
 def predict_stars(
     model: StarModel, source: ImageInput, threads: int | None, fixed: bool
 ) -> Prediction:
-    """Return the predictions of all stars of an image, with sentences on what limits them.
+    """Return the predictions of all stars of an image, with warnings about their limits.
 
     Parameters
     ----------
@@ -38,24 +38,24 @@ def predict_stars(
     source : ImageInput
         The image with its list and its options.
     threads : int or None
-        None takes all cores.
+        Number of threads; None uses all cores.
     fixed : bool
-        Listed centres are exact.
+        True if the listed centres are exact, and are not fitted.
 
     Raises
     ------
     PredictionError
-        If the image has pixels of another scale, or of an unknown one.
+        As `open_for_model`.
     ObservationError
         If the image or its list cannot be used, or the positions of the list are far off.
     """
     observation = open_for_model(model, source, fixed)
-    # Of the stamps, only the offsets of the stars from their list stay in memory.
+    # Of the stamps, only the offsets of the stars from their listed positions stay in memory.
     predictions, offsets = [], []
     for stamps, prediction in model.stream(observation, threads, fixed):
         predictions.append(prediction)
         offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
-    # The stars are near the listed positions, or the list is refused.
+    # `list_offset` raises an error if the stars are far from their listed positions.
     offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     notes = [observation.summary(), offset_note if isinstance(observation, Image) else None]
     prediction = Prediction.joined(predictions)
@@ -70,41 +70,41 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
     Raises
     ------
     PredictionError
-        If its pixel scale is another one, or not known; or if listed centres are exact (`fixed`),
-        and the list is missing, or the model does not measure centres.
+        If its pixel scale is unknown or differs from the model's; or if listed centres are exact
+        (`fixed`), and the input is not an image, or the model does not measure centres.
     """
     observation = open_observation(source, model.info.stamp_px, model.margin_px)
     if model.info.source == "stars":
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assume_scale()
-    statement = f" (scale assumed, {keyword('pixel_scale_arcsec')} sets it)"
-    scale_note = statement if observation.scale_assumed else ""
+    advice = f" (scale assumed, {keyword('pixel_scale_arcsec')} sets it)"
+    scale_note = advice if observation.scale_assumed else ""
     model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{scale_note}")
     if fixed and not (model.method.knows_field and isinstance(observation, Image)):
         raise PredictionError(
-            f"{source.path}: {call('fixed=True', '--fixed-positions')} takes an image with a star "
+            f"{source.path}: {call('fixed=True', '--fixed-positions')} needs an image with a star "
             f"list, and a model of the method field"
         )
     return observation
 
 
 def notes_on_model(model: StarModel, observation: Observation, unlike_count: int) -> list[str]:
-    """Return sentences on what limits the trust in predictions of an image.
+    """Return warnings about limits of the predictions for an image.
 
-    They are on another frame or instrument than the training's, on stars unlike the training's
-    (`unlike_count` is their number), and on light outside of stamps.
+    They concern a frame or instrument other than the training image's, stars unlike the training
+    stars (`unlike_count` is their number), and light outside the stamps.
     """
     notes = model.to_image_frame(observation)[1]
-    # Another telescope, camera or filter, as far as both images name theirs.
+    # Another telescope, camera or filter, if both headers name it.
     if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
-    # Of stars as in the training, 0.1 % have this flag.
+    # Of stars like the training stars, 0.1 % have this flag.
     if unlike_count >= max(3, 0.1 * observation.count):
-        misfit = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
-        notes.append(f"{observation.path}: {misfit}: {CAUSES}")
+        fraction = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
+        notes.append(f"{observation.path}: {fraction}: {CAUSES}")
     if isinstance(observation, Image) and model.method.knows_field and not model.wings:
         notes.append(
-            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
+            "flux_total is NaN: no bright training star showed light outside its stamp of "
             f"{model.stamp_px} px; flux is the light in the stamp"
         )
     return notes
@@ -116,11 +116,11 @@ def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) ->
     Parameters
     ----------
     stamps : Stamps
-        Stars as they were cut at the listed positions.
+        Stamps cut at the listed positions.
     prediction : Prediction
         Predictions of these stamps.
     margin_px : int
-        Pixels by which a star may have been moved to the middle of its stamp.
+        Largest shift, in pixels, by which a star may have been moved to the middle of its stamp.
 
     Returns
     -------
@@ -129,29 +129,29 @@ def offsets_from_list(stamps: Stamps, prediction: Prediction, margin_px: int) ->
     """
     # A model that measures centres (field) gives the offset itself.
     centre_offset = np.stack([prediction.x_fit - stamps.x, prediction.y_fit - stamps.y], axis=1)
-    # For another one, it is the shift by which the stamp was centred on its brightest pixel. A star
-    # that is off by more than the margin allows is given a pixel more than that.
-    off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
+    # For other models, the offset is the shift that centred the stamp on its brightest pixel. Stars
+    # farther off than the margin get the margin plus one pixel.
+    is_off_centre = (prediction.flags & int(StarFlag.OFF_CENTRE)) > 0
     shift = np.stack([prediction.shift_x, prediction.shift_y], axis=1)
-    shift = np.where(off_centre[:, None], margin_px + 1.0, shift)
+    shift = np.where(is_off_centre[:, None], margin_px + 1.0, shift)
     # Noise moves the brightest pixel of a faint star.
-    unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
-    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
+    is_unclear = (prediction.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    is_unclear |= ~np.isfinite(stamps.listed).all(axis=1)
     offset = np.where(np.isfinite(centre_offset), centre_offset, shift)
-    return np.where(unclear[:, None], np.nan, offset)
+    return np.where(is_unclear[:, None], np.nan, offset)
 
 
 def other_instrument(model: StarModel, observation: Observation) -> str:
     """Describe how an image's telescope, camera or filter differs from the training image.
 
-    The colours of the star lists count as well, where the image's list has any.
+    The columns of colours are compared, too, if the image's star list has one.
 
     Returns
     -------
     difference : str
-        Empty if all that both headers and lists name is the same.
+        Empty if the values that both images name are the same.
     """
-    # What the headers of both images name: telescope, camera, filter; and the lists: a colour.
+    # Telescope, camera and filter of the headers, and the column of colours of the star lists.
     stars, instrument = model.info.config.get("stars", {}), observation.instrument
     trained_on = dict(stars.get("instrument", {}))
     if observation.colour_column and "colour_column" in stars:

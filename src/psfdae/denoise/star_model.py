@@ -1,7 +1,7 @@
 """`StarModel`: a model of the PSF, with the call that denoises stars.
 
-A stamp, or an image with its star list, goes in; a `Prediction` with PSFs, their errors, fluxes and
-flags comes out. The steps are in `psfdae.denoise.denoiser`.
+Inputs: stamps, or an image with its star list. Outputs: a `Prediction` with PSFs, their errors,
+fluxes and flags. The steps are in `psfdae.denoise.denoiser`.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ SCALE_TOLERANCE = 0.02
 
 
 class StarModel(FieldPsfs):
-    """Fitted method with all that it takes to denoise stars: photometry, errors and limits.
+    """Fitted method with the flux model, error model and limits that denoising needs.
 
     Parameters
     ----------
     bundle : Bundle
-        `load` reads one from a file.
+        Contents of a model file; `load` reads them.
     method : Method, optional
-        The method of its arrays; by default it is unpacked from them.
+        Fitted method of the bundle; by default it is built from the arrays of the bundle.
     """
 
     margin_px: ClassVar[int] = 2
-    """Pixels by which a star of an image may be moved to the middle of its stamp."""
+    """Largest shift, in pixels, that moves a star of an image to the middle of its stamp."""
 
     max_stars_read: ClassVar[int] = 1024
     """Stars of an image that are read at a time; fewer if their stamps are large."""
@@ -85,7 +85,7 @@ class StarModel(FieldPsfs):
         return cls(read_bundle(None if path is None else Path(path)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle and copy the bundle alone, from which all else is made."""
+        """Pickle and copy the bundle alone, from which everything else is built."""
         return type(self), (self.bundle,)
 
     def __repr__(self) -> str:
@@ -96,7 +96,7 @@ class StarModel(FieldPsfs):
         )
 
     def _repr_html_(self) -> str:
-        """Return what `psfdae describe` says of use and training, for a notebook."""
+        """Return the facts on use and training in `psfdae describe` as HTML, for a notebook."""
         # Facts on the file and on conventions are left to the command.
         left_out = {"Name", "Written", "Licence", "SHA-256", "Framing", "Normalisation"}
         left_out |= {"Noise-equivalent area", "Flagged as unlike"}
@@ -109,12 +109,12 @@ class StarModel(FieldPsfs):
         return "".join(tables)
 
     def replace_errors(self, errors: ErrorModel) -> Self:
-        """Return the same model with other errors."""
+        """Return the same model with another error model."""
         return type(self)(replace(self.bundle, errors=errors), self.method)
 
     @property
     def info(self) -> BundleInfo:
-        """Stamp size, pixel scale, range of S/N and all else that the bundle says."""
+        """Stamp size, pixel scale, range of S/N and the other metadata of the bundle."""
         return self.bundle.info
 
     @property
@@ -124,7 +124,7 @@ class StarModel(FieldPsfs):
 
     @check_arguments
     def save(self, path: str | Path) -> None:
-        """Write the model to a file, by custom NAME.psf.safetensors, for `load_model`."""
+        """Write the model to a file, by convention NAME.psf.safetensors, for `load_model`."""
         write_bundle(self.bundle, Path(path))
 
     @check_arguments
@@ -152,49 +152,49 @@ class StarModel(FieldPsfs):
         Parameters
         ----------
         stamps : array, masked array, Quantity or NDData, shape (n, s, s) or (s, s)
-            Masked pixels are bad; an NDData's σ, its median in a stamp, is the noise that is not
-            given. s = `info.stamp_px` + 2 `margin`; in any unit, sky included, the star's
-            brightest pixel about [s/2, s/2] (0-based), pixels of the scale
-            `info.pixel_scale_arcsec`.
+            Stars in any unit, sky included, with the pixel scale `info.pixel_scale_arcsec` and
+            s = `info.stamp_px` + 2 `margin`. The brightest pixel is near [s/2, s/2] (0-based).
+            Masked pixels are bad. If `noise` is not given, it is the median of an NDData's σ in
+            the stamp.
         flux, background, noise : float or array, shape (n,), optional
             Flux inside the stamp, sky level and RMS of the sky noise in a pixel, in
-            the unit of the stamps. What is not given, or is NaN, is estimated.
+            the unit of the stamps. Values that are not given, or NaN, are estimated.
         bad, saturated : array of bool, shape of the stamps, optional
-            Pixels that must not be used; those that are not finite never are.
+            Pixels that must not be used; pixels that are not finite are never used.
         gain : float or array, shape (n,), optional
             Electrons per unit of the stamps: adds the star's photon noise to `chi2`
             and `flux_error`.
         position : array, shape (n, 2) to (n, 4), optional
-            (x, y) of the stars in the image of the training, 0-based; NaN where unknown. The third
-            number is the magnitude −2.5 log₁₀ (flux / counts), by default of the flux in the
-            stamp, the fourth the colour; they count where the PSF of the training stars changes
-            with their brightness and colour.
+            (x, y) of the stars in the training image, 0-based pixel coordinates; NaN where
+            unknown. The third column is the magnitude −2.5 log₁₀ (flux / counts), by default of
+            the flux in the stamp, and the fourth the colour; they are used if the PSF of the
+            training stars changes with their brightness and colour.
         centre : array, shape (n, 2), optional
-            (x, y) of the stars' centres that a list says, from index s//2; NaN where unknown.
-            Like the position, for models that measure centres (`psfdae.methods.field`).
+            Listed centres (x, y) of the stars, in pixels from index s//2; NaN where unknown.
+            Only models that measure centres (`psfdae.methods.field`) use `position` and `centre`.
         fixed : bool
-            These centres are exact.
+            True if these centres are exact, and are not fitted.
         margin : int
-            Pixels around each stamp, by which a star may be moved to centre it.
+            Additional pixels on each side of the stamps, by which a star may be moved to centre it.
         threads : int, optional
-            None takes all cores.
+            Number of threads; None uses all cores.
 
         Returns
         -------
         Prediction
-            One row per star, also of those that are flagged.
+            One row per star, flagged stars included.
 
         Raises
         ------
         PredictionError
             If shapes or types do not fit.
         """
-        # Check the arrays, and make them to stamps.
+        # Check the arrays, and convert them to stamps.
         side = self.stamp_px + 2 * margin
         numbers = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         masks = {"bad": bad, "saturated": saturated}
         stars, unit = make_stamps(stamps, side, self.name, numbers, masks, position, centre)
-        # Blocks of stars, side by side; each is denoised as if it were alone.
+        # Blocks of stars are denoised in parallel; each star as if it were alone.
         blocks = stars.split(self.denoiser.block_size)
         threads = min(threads or available_cores(), len(blocks))
         with use_one_thread_each():
@@ -204,12 +204,12 @@ class StarModel(FieldPsfs):
     def stream(
         self, observation: Observation, threads: int | None = None, fixed: bool = False
     ) -> Iterator[tuple[Stamps, Prediction]]:
-        """Yield the stars of an observation in their order, some at a time, with predictions.
+        """Yield chunks of the stars of an observation, in their order, with predictions.
 
-        Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
-        taken.
+        Only a few chunks are in memory at a time. Listed centres are exact if `fixed`. By default,
+        all cores are used.
         """
-        # Stamps are read in chunks, each of which is denoised in blocks by a thread of its own.
+        # Stamps are read in chunks; one thread denoises the blocks of a chunk.
         denoiser = self.to_image_frame(observation)[0].denoiser
         size = denoiser.block_size
 
@@ -223,19 +223,19 @@ class StarModel(FieldPsfs):
             for stamps, prediction in run_ordered(
                 predict_chunk, chunks, threads or available_cores()
             ):
-                # Columns of the star list go along with the stars' rows.
+                # Add the columns of the star list for the rows of these stars.
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
-                # The star on the sky, by its own centre where the model measures one.
+                # Sky coordinates of the fitted centre if the model measures one, else of the list.
                 x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
                 y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
-                on_sky = replace(
+                prediction_on_sky = replace(
                     prediction,
                     columns=prediction.columns | observation.sky_columns(x, y),
                     list_columns=None if list_columns is None else list_columns[rows],
                     unit=observation.unit,
                 )
-                yield stamps, on_sky
+                yield stamps, prediction_on_sky
                 advance(len(prediction))
 
     @property
@@ -250,38 +250,40 @@ class StarModel(FieldPsfs):
 
     @property
     def wings(self) -> Wings | None:
-        """Light of stars beyond their stamps, if the bundle says any."""
+        """Light of stars outside their stamps, if the bundle has it."""
         return self.denoiser.wings
 
     def flux_error(self, position: np.ndarray) -> np.ndarray:
         """Return the relative flux errors of stars at positions (n, 2), x and y, due to the PSF.
 
-        Standard errors over the flux (n,) of stars on a sky that is a map of the image. In the
-        middle of the field, they are not below the RMS over the whole field: a map of the sky has
-        errors there as well, which no field knows.
+        They are standard errors over the flux, shape (n,), for stars whose sky comes from the sky
+        map. In the middle of the field they are at least the RMS over the whole field: the sky map
+        has errors there, too, which the model of the field does not include.
         """
         errors = self.bundle.errors.model_errors
         return np.asarray(errors.fitted_flux * np.maximum(errors.flux_factor(position), 1.0))
 
     @property
     def image_px(self) -> tuple[int, int] | None:
-        """Columns and rows of the image of the training stars, if the bundle says it."""
+        """Columns and rows of the image of the training stars, if the bundle has it."""
         size = self.info.config.get("stars", {}).get("image_px")
         return None if size is None else (size[0], size[1])
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and greatest position (x, y) of training stars; raises as `psf_at`."""
+        """Return the minimum and maximum (x, y) of the training stars; raises as `psf_at`."""
         self._field()
         # The field's polynomial has its range in its arrays.
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
-        # Stars without positions leave zeros; a star alone is at one position.
+        # Both limits are 0 for stars without positions, and equal for a single star.
         if not ((high > low) | ((high == low) & (low != 0))).all():
             raise PredictionError(f"the model {self.name!r} knows no positions of its stars")
         return low, high
 
     @property
     def magnitude_range(self) -> tuple[float, float] | None:
-        """Lowest and highest magnitude with which the PSF changes; None if it does not."""
+        """Minimum and maximum magnitude between which the PSF changes; None if it does not."""
+        if not self.method.knows_field:
+            return None
         low, high = (self.bundle.weights[name].tolist() for name in ("low", "high"))
         return (low[2], high[2]) if len(low) > 2 and high[2] > low[2] else None
 
@@ -297,10 +299,11 @@ class StarModel(FieldPsfs):
         return field
 
     def residual_variance(self, side_px: int) -> float:
-        """Return the mean variance of stars about the field, in the middle of a PSF of flux 1."""
+        """Return the mean variance of stars about the field model, in the middle of the stamp."""
         if not isinstance(self.method, FieldPrior):
             return np.nan
-        # Residuals of stars in the middle of their pixel (eq. 6): squares of modes, and diagonal.
+        # Covariance of the residuals of stars of flux 1 in the middle of their pixel (eq. 6): a
+        # diagonal, and modes, whose squares are variances.
         _, modes, diagonal = self.method.residuals_at(np.zeros(2))
         variance = (np.square(modes).sum(axis=0) + diagonal).reshape(self.stamp_px, -1)
         begin = self.stamp_px // 2 - side_px // 2
@@ -312,7 +315,7 @@ class StarModel(FieldPsfs):
         return self._field().psf_at(position, oversampling)
 
     def to_image_frame(self, observation: Observation) -> tuple[Self, list[str]]:
-        """Return the model in the pixel frame of an image, and notes on how frames differ."""
+        """Return the model in the pixel frame of an image, and warnings if the frames differ."""
         size = self.image_px
         if not self.method.knows_field or size is None or not isinstance(observation, Image):
             return self, []
@@ -326,11 +329,12 @@ class StarModel(FieldPsfs):
         is_moved = offset is not None and np.abs(offset).max() > 1e-3
         if not is_moved and (sizes[0] == sizes[1]).all():
             return self, []
-        words = "{}×{} pixels, {}×{} in the training".format(*sizes[0], *sizes[1])
+        sizes_text = "{}×{} pixels, {}×{} in the training".format(*sizes[0], *sizes[1])
         if offset is None:
             advice = "headers do not show which part it is: positions are used as in the training"
-            return self, [f"{observation.path}: {words}; {advice}"]
-        # Positions of a model are the range of its field, and the middle from which errors grow.
+            return self, [f"{observation.path}: {sizes_text}; {advice}"]
+        # Shift all positions in the model: the range of its field (`low`, `high`), and the middle
+        # from which its errors grow.
         bundle, weights = self.bundle, dict(self.bundle.weights)
         for name in ("low", "high"):
             weights[name] = weights[name] - np.pad(offset, (0, len(weights[name]) - 2))
@@ -341,7 +345,7 @@ class StarModel(FieldPsfs):
         # Results name the file of the model.
         vars(shifted_bundle)["sha256"] = bundle.sha256
         frame = "by the headers, its first pixel is x {:g}, y {:g} there".format(*offset)
-        return type(self)(shifted_bundle), [f"{observation.path}: {words}; {frame}"]
+        return type(self)(shifted_bundle), [f"{observation.path}: {sizes_text}; {frame}"]
 
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
         """Raise an error if the pixels of stars differ in scale from the training stars.
@@ -349,17 +353,17 @@ class StarModel(FieldPsfs):
         Parameters
         ----------
         pixel_scale_arcsec : float or None
-            None if nobody knows it.
+            Pixel scale of the stars; None if it is unknown.
         source : str
             Name of the file, for the message.
 
         Raises
         ------
         PredictionError
-            If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
+            If the scale is unknown, or its relative difference exceeds `SCALE_TOLERANCE`.
         """
         model_scale = self.info.pixel_scale_arcsec
-        advice = f"; {call('psfdae.fit', 'psfdae train')} trains one on an image of yours"
+        advice = f"; {call('psfdae.fit', 'psfdae train')} trains a model on your image"
         if pixel_scale_arcsec is None:
             raise PredictionError(
                 f"{source}: neither a WCS nor the header gives the pixel scale; "

@@ -1,7 +1,8 @@
-"""Method `gmm`: a Gaussian mixture of noise-free stars, whose posterior mean restores the PSF.
+"""Method `gmm`: a Gaussian mixture of noise-free stars, whose posterior mean is the denoised PSF.
 
-The mixture is in `psfdae.methods.mixture.prior`. The class of this module chooses it by
-validation stars, applies it and stores it. Equations are numbered as on the page docs/mixture.md.
+`psfdae.methods.mixture.prior` has the mixture. The class of this module chooses its settings by
+validation stars, and fits, applies and stores it. Equations are numbered as on the page
+docs/mixture.md.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ from psfdae.stars.noise import build_noise
 
 
 class Gmm(Group):
-    """Mixture of Gaussians; validation stars choose where several values are given."""
+    """Mixture of Gaussians; validation stars choose among several values of a setting."""
 
     stars: Count | None = None
     """Number of training stars; null: all."""
     components: Annotated[list[Count], Field(min_length=1)] = Field([16, 1, 4, 64, 128])
-    """Numbers of clusters K; the search begins at the first one and continues while it pays.
-    Numbers above the number of stars are skipped."""
+    """Numbers of clusters K; the search starts at the first one, and continues while the error
+    decreases. Numbers above the number of stars are skipped."""
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field([10.0, 3.0, 30.0, 100.0])
-    """Weight ν of the common covariance in each cluster, in stars; the search begins at the first
-    one, too."""
+    """Weight ν of the common covariance in each cluster, in stars; the search starts at the
+    first one."""
     principal: Count = 40
-    """Principal components in which stars are clustered."""
+    """Number of principal components in which stars are clustered."""
     place: Positive = 1.0
     """RMS of the field position over the RMS of the principal components, for methods with the
     position as input."""
@@ -77,17 +78,17 @@ class GaussianMixture(MixturePrior, Method):
             "count": ("1", "stars of each cluster"),
             "rows": ("1", "rows of deviation of each cluster"),
             "mean": ("1", "mean image of each cluster, in the axes"),
-            "mean_reference": ("1", "mean reference of each cluster"),
+            "mean_reference": ("1", "mean target of each cluster"),
             "deviation": ("1", "images less the mean of their cluster, in the axes"),
-            "deviation_reference": ("1", "references less the mean of their cluster"),
-            "cross": ("1", "covariance of references and images (in the axes) within clusters"),
-            "variance_reference": ("1", "variance of references within clusters"),
+            "deviation_reference": ("1", "targets less the mean of their cluster"),
+            "cross": ("1", "covariance of targets and images (in the axes) within clusters"),
+            "variance_reference": ("1", "variance of targets within clusters"),
             "whitening": ("1", "to positions of unit variance within clusters"),
             "center": ("1", "mean whitened position of each cluster"),
-            "deviation_center": ("1", "whitened positions less the position of their cluster"),
+            "deviation_center": ("1", "whitened positions less the mean of their cluster"),
             "slope": ("1", "common change of images (in the axes) with whitened position"),
-            "slope_reference": ("1", "common change of references with whitened position"),
-            "shrinkage": ("1", "stars that the common covariance counts for"),
+            "slope_reference": ("1", "common change of targets with whitened position"),
+            "shrinkage": ("1", "weight of the common covariance, in stars"),
         },
         per_reference=True,
     )
@@ -104,30 +105,32 @@ class GaussianMixture(MixturePrior, Method):
         FitError
             If every K exceeds the number of stars.
         """
-        # With a single value of each number, all stars are used for the fit.
+        # With a single value of K and of ν, nothing is chosen, and all stars are used for the fit.
         is_search = len(gmm.components) * len(gmm.shrinkage) > 1
-        learn, judge = (data.fit, data.validation) if is_search else (data.train, data.train[:0])
-        learn = learn[: gmm.stars]
-        if is_search and not judge.size:
-            # Without validation stars, every tenth training star is one.
-            judge, learn = learn[::10], np.delete(learn, np.s_[::10])
+        fitted, validation = (data.train, data.train[:0])
+        if is_search:
+            fitted, validation = data.fit, data.validation
+        fitted = fitted[: gmm.stars]
+        if is_search and not validation.size:
+            # Without validation stars, every tenth training star is used as one.
+            validation, fitted = fitted[::10], np.delete(fitted, np.s_[::10])
         # A cluster has at least one star.
-        sizes = [k for k in gmm.components if k <= learn.size]
+        sizes = [k for k in gmm.components if k <= fitted.size]
         if not sizes:
             raise FitError(
                 f"{next(iter(cls.groups))}.components = {gmm.components}: "
-                f"must be at most {learn.size}, the number of training stars"
-                f"{' without those that choose' if is_search else ''}"
+                f"must be at most {fitted.size}, the number of training stars"
+                f"{' without the validation stars' if is_search else ''}"
             )
         # The final mixture is fitted to the validation stars, too.
         k, nu, uses_position = sizes[0], gmm.shrinkage[0], cls.needs.position
         if is_search:
             k, nu, uses_position = best_on_validation(
                 lambda k, uses_position: cls.fit_clusters(
-                    data, learn, k, gmm.shrinkage[0], uses_position, gmm
+                    data, fitted, k, gmm.shrinkage[0], uses_position, gmm
                 ),
                 data,
-                judge,
+                validation,
                 sizes,
                 gmm.shrinkage,
                 cls,
@@ -138,12 +141,12 @@ class GaussianMixture(MixturePrior, Method):
     def fit_clusters(
         cls, data: TrainingSet, stars: np.ndarray, k: int, nu: float, uses_position: bool, gmm: Gmm
     ) -> Self:
-        """Return the mixture of some stars, with or without the position.
+        """Fit the mixture to some of the stars, with or without their positions.
 
         Parameters
         ----------
         data : TrainingSet
-            Images, references and positions of the stars.
+            Images, targets (`references`) and positions of the stars.
         stars : ndarray of int
             Indices of the stars.
         k : int
@@ -151,7 +154,7 @@ class GaussianMixture(MixturePrior, Method):
         nu : float
             ν, the weight of the common covariance, as a number of stars.
         uses_position : bool
-            Use the position; otherwise all stars have the same position.
+            True to use the positions; otherwise all stars have the same position.
         gmm : Gmm
             Settings of the clustering.
         """
@@ -161,8 +164,8 @@ class GaussianMixture(MixturePrior, Method):
             p = data.positions[stars].astype(np.float64) * uses_position
         x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
         cluster = k_means(x, p, k, gmm.principal, gmm.place, data.seed)
-        del x  # memory: it is needed again in another order
-        # The distributions of the clusters, and ν, which shrinks their covariances in use.
+        del x  # Free the memory: `mixture_arrays` makes another copy, sorted by cluster.
+        # Distributions of the clusters, and ν, which shrinks their covariances when they are used.
         arrays: dict[str, Any] = mixture_arrays(data, stars, p, cluster)
         return cls(**arrays, shrinkage=np.array([nu]), noise=data.noise)
 
@@ -170,20 +173,20 @@ class GaussianMixture(MixturePrior, Method):
     def from_arrays(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """Return a fit from its arrays, with the noise of the configuration."""
-        # A bundle may have the deviations in half precision.
+        """Return a fit from its arrays, with the noise settings of the configuration."""
         noise = build_noise(config["noise"])
+        # A bundle may have the deviations in half precision.
         fields: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
         return cls(**fields, noise=noise)
 
     def export(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return the arrays for a bundle, and fields of its `BundleInfo`.
 
-        Where the references are the images, the residuals of a cluster are replaced by its main
-        axes, with a variance of at least `flat_variance` times the noise variance.
+        If the targets are the images, the residuals of a cluster are replaced by its main axes,
+        with a variance of at least `flat_variance` times the noise variance.
         """
         arrays, info_fields = super().export(stamp_px, noise)
-        # Residuals of references and positions refer to single stars and cannot be replaced.
+        # Residuals of targets and positions belong to individual stars and cannot be replaced.
         if len(self.cross) or self.whitening.size:
             return arrays, info_fields
         # Coordinates below the minimum noise of the bundle are left out.
@@ -202,7 +205,7 @@ class GaussianMixture(MixturePrior, Method):
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
         """Return the arrays of a bundle with their shapes; None for any shape."""
-        # The other arrays depend on the number of clusters and of their main axes.
+        # Shapes of the other arrays depend on the numbers of clusters and of their main axes.
         pixels = info.stamp_px**2
         return dict.fromkeys(cls.list_arrays()) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
@@ -214,10 +217,10 @@ class GaussianMixture(MixturePrior, Method):
     def outlier_score(
         self, noisy: np.ndarray, level: np.ndarray, near_clusters: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the score by the leading `outlier_coordinates` (eq. 12 of docs/mixture.md).
+        """Return the outlier score in the leading `outlier_coordinates` (eq. 12).
 
-        The others contain mostly noise, whose level is an estimate: an error of it would dominate
-        their χ².
+        The other coordinates contain mostly noise, and the error of the estimated noise level would
+        dominate their χ².
         """
         mixture = self.outlier_mixture
         # s of each image, as for the weights of the clusters (eq. 1).
@@ -237,14 +240,14 @@ class GaussianMixture(MixturePrior, Method):
         return replace(self, flux_sigma=FLUX_SIGMA)
 
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flux factor a of each image, and which clusters are near, (n, K) (eq. 11).
+        """Return the flux factor a of each image, and True for near clusters, (n, K) (eq. 11).
 
         The factor is the flux over the flux by which the image was divided; 1 for known fluxes.
         """
         flux = np.empty(len(noisy))
         is_near = np.zeros((len(noisy), len(self.count)), bool)
         for part, batch in star_batches(self, noisy, level):
-            # `estimate` and `outlier_score` may skip clusters without weight.
+            # `estimate` and `outlier_score` may skip clusters of weight 0.
             weight, _ = cluster_weights(self, batch)
             is_near[part] = weight > 0
             flux[part] = flux_factor(self, batch, weight)
@@ -258,10 +261,10 @@ class GaussianMixture(MixturePrior, Method):
         with_sigma: bool = True,
         near_clusters: np.ndarray | None = None,
     ) -> Estimate:
-        """Return PSFs, float32, their standard deviation, and the evidence of every image.
+        """Return PSFs and their standard deviations, float32, and the ln evidence of each image.
 
-        Only `near_clusters` of an image are used, shape (n, K) of bool, by default the nearest
-        clusters by the common covariance.
+        `near_clusters`, bool of shape (n, K), is True for the clusters to use; by default these are
+        the nearest clusters by the common covariance.
 
         Raises
         ------
@@ -272,7 +275,7 @@ class GaussianMixture(MixturePrior, Method):
         evidence, flux = np.empty((2, len(noisy)))
         for part, batch in star_batches(self, noisy, level, position):
             is_near = None if near_clusters is None else near_clusters[part]
-            # Weights of the clusters, then the sums over them (eq. 6, 7 and 8).
+            # Weights of the clusters, then sums over the clusters (eq. 6, 7 and 8).
             weight, evidence[part] = cluster_weights(self, batch, is_near)
             mean, mean_sigma = posterior_mean(self, batch, weight, with_sigma)
             if self.flux_sigma:
@@ -281,6 +284,6 @@ class GaussianMixture(MixturePrior, Method):
                 if self.restores_images:
                     mean += ((flux[part] - 1.0) / mean.shape[1])[:, None]
             psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (mean, mean_sigma))
-        # Known fluxes are not returned.
+        # The flux is returned only if it was estimated.
         flux_or_none = flux if self.flux_sigma else None
         return Estimate(psf, sigma if with_sigma else None, evidence, flux_or_none)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Protocol, Self, TypeAlias
 
 import numpy as np
@@ -34,7 +35,7 @@ Oversampling: TypeAlias = Annotated[int, Field(ge=1, le=32)]
 
 
 class PredictionError(Error, ValueError):
-    """Stars or positions that a model cannot be applied to; one line with what it takes instead.
+    """A model cannot be applied to these stars or positions; one line with the valid input.
 
     Examples
     --------
@@ -54,7 +55,7 @@ class FieldPsfs(ABC):
     name : str
         Name of the model.
     stamp_px : int
-        Side d of the stamps in which PSFs have the sum 1, even.
+        Even side d, in pixels, of the stamps in which PSFs have the sum 1.
     """
 
     name: str
@@ -75,38 +76,38 @@ class FieldPsfs(ABC):
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image that the model was trained on, if known."""
 
-    def flux_error(self, place: np.ndarray) -> np.ndarray:
-        """Return the errors of fluxes on a known sky that are due to the model, over the flux.
+    def flux_error(self, position: np.ndarray) -> np.ndarray:
+        """Return the relative flux errors of stars on a known sky that are due to the model.
 
         Parameters
         ----------
-        place : ndarray, shape (n, 2)
-            x and y of the stars.
+        position : ndarray, shape (n, 2)
+            x and y of the stars, 0-based pixel coordinates.
 
         Returns
         -------
         ndarray, shape (n,)
             0 if the errors of the model are not known.
         """
-        return np.zeros(len(place))
+        return np.zeros(len(position))
 
     @property
     def wings(self) -> Wings | None:
-        """Light of stars beyond their stamps, if it was measured."""
+        """Light of stars outside their stamps, if it was measured."""
         return None
 
     @abstractmethod
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+        """Return the minimum and maximum (x, y) of the training stars; raises as `psf_at`."""
 
     @property
     def magnitude_range(self) -> tuple[float, float] | None:
-        """Lowest and highest magnitude with which the PSF changes; None if it does not."""
+        """Minimum and maximum magnitude between which the PSF changes; None if it does not."""
         return None
 
     @abstractmethod
     def check_scale(self, pixel_scale_arcsec: float | None, source: str) -> None:
-        """Raise PredictionError if pixels have not the size of the model's.
+        """Raise PredictionError if the pixel scale differs from the model's.
 
         `source` names the image in the message.
         """
@@ -117,9 +118,10 @@ class FieldPsfs(ABC):
         Returns
         -------
         model : FieldPsfs
-            The same where the headers do not show the place (`psfdae.image.detector_frame`).
+            The same model where the headers do not give the position of the image on the detector
+            (`psfdae.image.detector_frame`).
         notes : list of str
-            A sentence on an image of another size or place than the training's.
+            A warning if the image differs from the training image in size or position.
 
         Raises
         ------
@@ -129,17 +131,17 @@ class FieldPsfs(ABC):
         return self, []
 
     def residual_variance(self, side_px: int) -> float:
-        """Return the mean variance of training stars about their PSF, over the flux squared.
+        """Return the mean variance of pixels of training stars about their PSF, over the flux².
 
         Parameters
         ----------
         side_px : int
-            Odd side of the square of pixels about a star.
+            Odd side, in pixels, of the square around a star over which the mean is taken.
 
         Returns
         -------
         float
-            NaN if it is not known.
+            NaN if the variance is not known.
         """
         return np.nan
 
@@ -160,19 +162,19 @@ class FieldPsfs(ABC):
         mag: Numbers | None = None,
         colour: Numbers | None = None,
     ) -> np.ndarray:
-        """Return PSFs at positions of the training image, where no star need be.
+        """Return PSFs at any positions in the training image.
 
         Parameters
         ----------
         x, y : float or array, shape (n,)
-            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
+            0-based pixel coordinates. The PSF has their sub-pixel phase.
         oversampling : int
-            Values per pixel and axis; each is what a whole pixel there would get.
+            Values per pixel and axis; each is the light in a whole pixel around its point.
         mag, colour : float or array, shape (n,), optional
             Instrumental magnitude −2.5 log₁₀ (flux / counts), and colour as in the star list; by
-            default the PSF is the average over the training stars. Outside their range it
-            is as at the nearest end; it changes with either only where stars that
-            were left out of the training say so.
+            default the PSF is the average over the training stars. Outside their range, it is
+            the PSF of the nearest end. It depends on either only if this dependence reduces the
+            error of held-out stars.
 
         Returns
         -------
@@ -189,18 +191,22 @@ class FieldPsfs(ABC):
         """
         # Columns up to the last given one; NaN for a missing column before it.
         columns = {"x": x, "y": y, "mag": mag, "colour": colour}
-        is_stated = [value is not None for value in columns.values()]
-        count = 4 if is_stated[3] else 3 if is_stated[2] else 2
+        is_given = [value is not None for value in columns.values()]
+        count = 4 if is_given[3] else 3 if is_given[2] else 2
         numbers = [
             real_numbers(name, np.nan if value is None else value, PredictionError)
             for name, value in columns.items()
         ]
-        position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
-        if position.ndim > 2 or not np.isfinite(position[..., is_stated[:count]]).all():
+        # NaN stands for arrays of different lengths, which have no common shape.
+        position = np.full((1, count), np.nan)
+        with suppress(ValueError):
+            position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position[..., is_given[:count]]).all():
             raise PredictionError(
-                "positions, mag and colour must be finite, one of each or arrays of as many"
+                "x, y, mag and colour must be finite: numbers, or one-dimensional arrays of the "
+                "same length"
             )
-        # A position far outside the image may overflow, which is refused below.
+        # Polynomials may overflow far outside the image; such PSFs raise an error below.
         with np.errstate(all="ignore"):
             psfs = self.draw_psfs(position.reshape(-1, count), oversampling)
         # The flux of a PSF is about 1. Far outside the image, or in a damaged file, polynomials may
@@ -225,21 +231,23 @@ class FieldPsfs(ABC):
 
     @check_arguments
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
-        """Return the flux of a star over its light within an aperture.
+        """Return the total flux of a star over its flux in an aperture.
 
-        The flux is all light within `wings.radius_px[-1]`, or without wings that in the stamp.
+        The total flux is the light within `wings.radius_px[-1]`, or in the stamp if there are no
+        wings.
 
         Parameters
         ----------
         x, y : float
             Centre of star and aperture, 0-based pixel coordinates.
         radius_px : float
-            Radius of the aperture.
+            Radius of the aperture in pixels.
 
         Raises
         ------
         ValueError
-            If the radius is not above 0, or is larger than the radius of the flux.
+            If the radius is not above 0, or exceeds `wings.radius_px[-1]`, or half the stamp if
+            there are no wings.
         PredictionError
             As `psf_at`.
         """
@@ -247,7 +255,7 @@ class FieldPsfs(ABC):
 
     @check_arguments
     def grid(self, columns: NodeCount, rows: NodeCount) -> np.ndarray:
-        """Return positions (n, 2), x and y, evenly over the field; raises as `field_range`."""
+        """Return positions (n, 2), x and y, of a grid over the field; raises as `field_range`."""
         # Rows of the grid follow each other: x changes fastest.
         low, high = self.field_range()
         x, y = (np.linspace(low[i], high[i], count) for i, count in ((0, columns), (1, rows)))
@@ -255,7 +263,7 @@ class FieldPsfs(ABC):
 
     def fwhm_px(self) -> float:
         """Return the FWHM of the PSF in the middle of the field; raises as `psf_at`."""
-        # In the middle of a pixel, so that the FWHM does not depend on a phase.
+        # In the middle of a pixel, so that the FWHM does not depend on the sub-pixel phase.
         x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
         return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
@@ -263,27 +271,29 @@ class FieldPsfs(ABC):
 def aperture_correction(
     model: FieldPsfs, wings: Wings | None, x: float, y: float, radius_px: float
 ) -> float:
-    """Return the whole flux of a star at (x, y), in px from 0, over that in an aperture about it.
+    """Return the total flux of a star at (x, y) over its flux in an aperture around it.
 
-    The aperture has parts of the pixels at its edge, as photutils' `CircularAperture`.
+    See `FieldPsfs.aperture_correction`. A pixel at the edge of the aperture is weighted by the
+    fraction of its area inside.
 
     Raises
     ------
     ValueError
-        If the radius is not above 0, or beyond the wings, or half the stamp without wings.
+        If the radius is not above 0, or exceeds the last radius of the wings, or half the stamp if
+        there are no wings.
     """
     from photutils.aperture import CircularAperture
 
     radius_max = model.stamp_px / 2 if wings is None else float(wings.radius_px[-1])
     if not 0 < radius_px <= radius_max:
         raise ArgumentError(f"radius_px {radius_px} px, expected above 0 up to {radius_max:g}")
-    # Light of the PSF in the aperture, about the star's place in the stamp.
+    # Light of the PSF in the aperture, centred on the star's position in the stamp.
     psf = model.psf_at(x, y, 1)
     middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
-    # All light over that in the aperture, each with the wings of this PSF.
+    # Total light over the light in the aperture, both with the wings of this PSF.
     scale = float(wings.scale(outer_shares(model.draw_on_pixels, np.array([[x, y]])))[0])
     all_wings, inner_wings = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
     return (1.0 + all_wings) / (inside + inner_wings)

@@ -1,7 +1,7 @@
 """Comparison of a model with one mean PSF, and checks that show whether to trust it.
 
-The numbers come from stars that no training saw (`psfdae.report.validation`); the answers stand in
-the report page (`psfdae.report.page`).
+The numbers come from stars that were held out of the training (`psfdae.report.validation`); the
+report page shows the answers (`psfdae.report.page`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Check = tuple[str, str, bool]
 
 
 def fit_mean_psf(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndarray:
-    """Shift one PSF to the centre that fits each star best, the least that a model has to beat.
+    """Shift one PSF to the centre that fits each star best: the simplest model of the PSF.
 
     Parameters
     ----------
@@ -39,20 +39,21 @@ def fit_mean_psf(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.nda
     ndarray, shape (n, d, d)
         The shifted PSF of each star, sum 1.
     """
+    count, side = noisy.shape[:2]
 
     def mean_at(offsets: np.ndarray) -> np.ndarray:
         """Return the mean PSF (k, d, d) of sum 1, shifted by offsets (k, 2) in pixels."""
         psf = cut(shift_stamps(mean[None], offsets, np.zeros(len(offsets), int)), side)
         return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
-    count, side = noisy.shape[:2]
     # Steps of a quarter of a pixel: between them, the likelihood is close to a parabola.
     step_px = 0.25
     axis = np.arange(-reach_px, reach_px + step_px / 2, step_px)
-    lattice = mean_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
-    lattice = lattice.reshape(axis.size**2, -1)
-    # Log likelihood in white noise, −|x − t|² / 2, without the term that does not depend on t.
-    likelihood = noisy.reshape(count, -1) @ lattice.T - 0.5 * np.square(lattice).sum(axis=1)
+    templates = mean_at(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
+    templates = templates.reshape(axis.size**2, -1)
+    # ln likelihood times σ² in white noise, −|x − t|²/2 with the template t, without the term
+    # −|x|²/2, which does not depend on t.
+    likelihood = noisy.reshape(count, -1) @ templates.T - 0.5 * np.square(templates).sum(axis=1)
     likelihood = likelihood.reshape(count, axis.size, axis.size)
     maximum = np.stack(np.divmod(likelihood.reshape(count, -1).argmax(axis=1), axis.size), axis=1)
     # The parabola needs a point on either side of the maximum.
@@ -70,7 +71,7 @@ def fit_mean_psf(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.nda
 
 
 def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]:
-    """Return the MSE of a method over the MSE of a reference method by S/N, ascending.
+    """Return the MSE of a method over the MSE of a reference method, by ascending S/N.
 
     `errors` has the columns snr, method and mse. S/N at which a method was not measured are absent.
     """
@@ -83,7 +84,7 @@ def mse_ratios(errors: Table, method: str, reference: str) -> dict[float, float]
 
 
 def nearest_snr(values: Iterable[float]) -> float:
-    """Return the S/N that is nearest to 10 by its ratio, at which figures show errors.
+    """Return the S/N whose ratio to 10 is nearest to 1; figures show errors at this S/N.
 
     Stars of S/N 10 are faint enough for models to differ, and bright enough to be seen in a figure.
     """
@@ -106,8 +107,8 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times the MSE of one mean PSF"
     if linear and method != "lmmse":
         sentence += f", {linear[snr]:.2f} times the MSE of linear MMSE"
-    levels = ", ".join(f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1)
-    verdict = f"no better than the mean PSF at S/N {levels}" if levels else "better at each S/N"
+    worse = ", ".join(f"{snr:.3g}" for snr, ratio in mean.items() if ratio >= 1)
+    verdict = f"no better than the mean PSF at S/N {worse}" if worse else "better at each S/N"
     return f"{sentence}; {verdict} ({errors['stars'][0]} stars held out)"
 
 
@@ -117,7 +118,7 @@ def size_errors(images: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     Parameters
     ----------
     images : mapping of str to ndarray, shape (n, d, d)
-        Held-out stars: restored from degraded images (`model`), and bright (`truth`).
+        Held-out stars: denoised from degraded images (`model`), and the bright images (`truth`).
 
     Returns
     -------
@@ -160,26 +161,28 @@ def check_held_out(
     coverage : mapping of float to float
         Fraction of the errors of pixels within their predicted 68 % half-width, by S/N.
     denoised_images : mapping of float to mapping of str to ndarray, shape (n, d, d)
-        Held-out stars by S/N: bright (`truth`), and restored from degraded images by the model
-        (`model`) and by one mean PSF (`MEAN_PSF`).
+        Held-out stars by S/N: bright images (`truth`), and denoised from degraded images by the
+        model (`model`) and by one mean PSF (`MEAN_PSF`).
     """
     # Each row: question, answer at each S/N, and the verdict. Unmeasured quantities have no row.
     rows: list[Check] = []
-    # MSE beside the two simplest models of the PSF.
+    # MSE over the MSE of the two simplest models of the PSF.
     for label, reference in (("one mean PSF", MEAN_PSF), ("linear MMSE", "lmmse")):
         ratios = mse_ratios(errors, method, reference)
         by_snr = ", ".join(f"{ratio:.2f} at S/N {snr:.3g}" for snr, ratio in ratios.items())
         if ratios:
             rows.append((f"Better than {label}?", f"MSE × {by_snr}", max(ratios.values()) < 1))
-    # Bias of the size: at most 2 % of the FWHM beyond two standard errors. The standard error of a
-    # median is 1.25 σ/√n, of as many images as there are different stars.
+    # Bias of the size: at most 2 % of the FWHM plus two standard errors. The standard error of a
+    # median of n values is 1.25 σ/√n; n is at most the number of stars, because images of the same
+    # star are not independent.
     snr, held_out = nearest_snr(denoised_images), int(errors["stars"][0])
     size_error = size_errors(denoised_images[snr])[0]
     bias = float(np.median(size_error))
     stderr = 1.25 * float(size_error.std()) / np.sqrt(min(held_out, errors["images"][0]))
     answer = f"median {100 * bias:+.1f} ± {100 * stderr:.1f} %"
     rows.append((f"Size of stars of S/N {snr:.3g}", answer, abs(bias) < 0.02 + 2 * stderr))
-    # Coverage of the predicted errors, of pixels and then of flux and centre.
+    # Coverage of the predicted errors, of pixels and then of flux and centre: 68 ± 8 %, for flux
+    # and centre within two standard errors of the coverage.
     low, high = 0.60, 0.76
     if coverage:
         by_snr = ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items()))
@@ -192,7 +195,7 @@ def check_held_out(
         is_covered = all(low < v + 2 * e and v - 2 * e < high for _, v, e in cells)
         if cells:
             rows.append((f"Are 68 % of {name} errors within ± σ?", by_snr, is_covered))
-    # With fewer than 20 stars, all of the above is rough.
+    # With fewer than 20 stars, all other checks are rough estimates.
     return [*rows, ("Stars held out", f"{held_out}", held_out >= 20)]
 
 
@@ -202,11 +205,11 @@ def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
     `stars` has columns of the prediction and `part` of `selection.csv`, shape (n,) each.
     """
     checks: list[Check] = []
-    # χ² of stars that the model has not learnt from, by classes of S/N with at least five stars.
+    # χ² of stars that the model was not trained on, in classes of S/N with at least five stars.
     is_usable = (stars["flags"] == 0) & (stars["part"] != "training") & np.isfinite(stars["chi2"])
     snr_class = np.searchsorted((10.0, 100.0, 1000.0), stars["snr"])
     medians, answers = [], []
-    for index, label in enumerate(("below 10", "from 10", "from 100", "from 1000")):
+    for index, label in enumerate(("below 10", "10 to 100", "100 to 1000", "above 1000")):
         chi2 = stars["chi2"][is_usable & (snr_class == index)]
         if chi2.size >= 5:
             medians.append(float(np.median(chi2)))
@@ -215,7 +218,7 @@ def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
         question = "χ² of unflagged stars outside the training"
         is_passed = all(0.8 < median < 1.3 for median in medians)
         checks.append((question, ", ".join(answers), is_passed))
-    # Outliers: the model is not meant for an image where more than a tenth of the stars are.
-    outliers = float(((stars["flags"] & int(StarFlag.UNLIKE_TRAINING)) > 0).mean())
-    answer = f"{100 * outliers:.0f} % of the list"
-    return [*checks, ("Stars unlike the training", answer, outliers < 0.1)]
+    # The model does not suit an image where a tenth of the stars or more are outliers.
+    outlier_fraction = float(((stars["flags"] & int(StarFlag.UNLIKE_TRAINING)) > 0).mean())
+    answer = f"{100 * outlier_fraction:.0f} % of the list"
+    return [*checks, ("Stars unlike the training", answer, outlier_fraction < 0.1)]

@@ -35,25 +35,25 @@ from psfdae.telescope.settings import Seeing
 
 @dataclass(frozen=True)
 class Joint:
-    """Fitted numbers of a telescope, with their errors.
+    """Fitted numbers of a telescope, with their standard errors.
 
     Attributes
     ----------
     model : TelescopeModel
         Names, units and prior of the numbers.
     value, error : ndarray, shape (Q,)
-        Numbers of the telescope in the units of the model.
+        Numbers of the telescope and their standard errors, in the units of the model.
     correlation : ndarray, shape (Q, Q)
         Correlation of the errors.
     probability : float
-        Probability of these numbers against their twin, whose even aberrations have the opposite
-        sign.
+        Posterior probability of these numbers, 0 … 1; the rest is the probability of their twin,
+        whose even aberrations have the opposite sign.
     twin : ndarray or None, shape (Q,)
         Numbers of the twin, if there is one.
     star : ndarray of int, shape (m,)
         Indices of the stars in the fit, in the order of the search.
     disagrees : ndarray of bool, shape (m,)
-        True for stars whose deviance is above the limit, which the numbers do not explain.
+        True for stars that the numbers do not explain: their deviance exceeds the limit.
     """
 
     model: TelescopeModel
@@ -87,13 +87,13 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class TelescopePosterior:
-    """Posterior of the numbers of a telescope, and of positions, fluxes and skies of its stars.
+    """Posterior of the numbers of a telescope, and of the position, flux and sky of each star.
 
     Its parameters are the Q standardised numbers t of the telescope, (number − prior mean)/prior σ,
     whose prior is normal with σ = 1, then four for each star: position (x, y) from the middle of
-    the stamp in pixels, flux in units of `search.flux`, and sky above its level in units of its
-    noise. If the FWHM of the seeing is one of the numbers, stamps are linear in it about the seeing
-    of `optics`.
+    the stamp in pixels, flux in units of `search.flux`, and sky above its measured level B in
+    units of its noise √B in a pixel. If the FWHM of the seeing is one of the numbers, stamps are
+    linear in it about the seeing of `optics`.
 
     Attributes
     ----------
@@ -104,8 +104,8 @@ class TelescopePosterior:
     star : ndarray of int, shape (m,)
         Indices of the stars in the fit, in the order of the search.
     optics : StarOptics
-        Optics with the seeing about which stamps are linear; the optics of `search` keep the first
-        seeing.
+        Optics with the seeing about which stamps are linear; the optics of `search` keep the seeing
+        of the first round.
     """
 
     search: WavefrontSearch
@@ -123,7 +123,7 @@ class TelescopePosterior:
 
     @cached_property
     def broadening(self) -> SampledStamps:
-        """Propagation to derivatives of stamps with respect to ln FWHM of the seeing."""
+        """Propagation to the derivatives of stamps with respect to ln FWHM of the seeing."""
         return self.optics.propagation(self.optics.stamp_px, broadening=True)
 
     @property
@@ -139,7 +139,10 @@ class TelescopePosterior:
         return float(fwhm / self.seeing.fwhm_arcsec)
 
     def replace_seeing(self, t: np.ndarray) -> TelescopePosterior:
-        """Return the posterior whose optics have the seeing at standardised numbers t (Q,)."""
+        """Return the posterior whose optics have the seeing at standardised numbers t (Q,).
+
+        The FWHM decreases by at most `max_seeing_change`, relative to the present optics.
+        """
         fwhm = max(self.relative_seeing(t), 1.0 - self.max_seeing_change) * self.seeing.fwhm_arcsec
         # The same telescope with another seeing.
         seeing = self.seeing.model_copy(update={"fwhm_arcsec": fwhm})
@@ -147,11 +150,11 @@ class TelescopePosterior:
         return replace(self, optics=replace(self.optics, telescope=telescope))
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
-        """Return the coefficients of the stars (m, K) in waves at standardised numbers t (Q,)."""
+        """Return the aberrations of the stars, (m, K) in waves, at standardised numbers t (Q,)."""
         return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.star])
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the coefficients of the stars with respect to t, (m, Q, K)."""
+        """Return the derivatives of the coefficients with respect to t, (m, Q, K), in waves."""
         # ∂c/∂t = σ ∂c/∂number, from [number, star, coefficient] to [star, number, coefficient].
         jacobian = self.model.jacobian(self.model.mean + self.model.sd * t)
         return np.asarray(np.moveaxis(jacobian * self.model.sd[:, None, None], 0, 1)[self.star])
@@ -160,7 +163,7 @@ class TelescopePosterior:
         """Evaluate the posterior, as an `Evaluate` of `psfdae.sensing.climbing.climb`.
 
         The first argument, the indices of the starts, is not used. A telescope through which rays
-        cannot pass, or whose wavefronts no grid can sample, has a height of −∞.
+        cannot pass, or whose wavefronts are too steep for all pupil grids, has a height of −∞.
 
         Parameters
         ----------
@@ -170,10 +173,10 @@ class TelescopePosterior:
         Returns
         -------
         height, score, information : ndarray, shapes (a,), (a, N) and (a, N, N)
-            Logarithm of the posterior, its slope, and its expected information, with the prior.
+            ln of the posterior, its gradient, and its expected information, prior included.
         """
         q, (count, size) = self.number_count, parameters.shape
-        # Parameters without an image keep a height of −∞.
+        # Parameters for which no image can be computed keep a height of −∞.
         height, score = np.full(count, -np.inf), np.zeros((count, size))
         information = np.tile(np.eye(size), (count, 1, 1))
         # Normal prior of the numbers, flat priors of positions, fluxes and skies.
@@ -190,19 +193,19 @@ class TelescopePosterior:
         return height, score, information
 
     def evaluate_stars(self, parameters: np.ndarray) -> Evaluation:
-        """Evaluate every single star at `parameters` (Q + 4 m,), without any prior.
+        """Evaluate each star separately at `parameters` (Q + 4 m,), without the prior.
 
         Returns
         -------
         deviance, score, information : ndarray, shapes (m,), (m, Q + 4), (m, Q + 4, Q + 4)
-            Derivatives are with respect to the Q numbers of the telescope and four of the star.
+            Derivatives are with respect to the Q numbers and the four parameters of the star.
         """
         q, optics = self.number_count, self.optics
         t, star_parameters = parameters[:q], parameters[q:].reshape(len(self.star), 4)
-        place = star_parameters[:, :2]
-        # Stamps (m, d²) and their derivatives (m, Q + 2, d²) with respect to t, through the pupil
-        # modes (a basis, not `StarModes`), and to the position.
-        modes = optics.mode_coefficients(self.star, self.coefficients(t), place)
+        position_px = star_parameters[:, :2]
+        # Stamps (m, d²) and their derivatives (m, Q + 2, d²) with respect to t and the position, by
+        # the coefficients of the pupil's modes (a basis; these are not the peaks in `StarModes`).
+        modes = optics.mode_coefficients(self.star, self.coefficients(t), position_px)
         directions = self.slopes(t) @ optics.terms.to_modes[self.star]
         stamps, slopes = optics.derivatives(modes, directions)
         if self.model.has_seeing:
@@ -218,15 +221,15 @@ class TelescopePosterior:
 def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeModel) -> Joint:
     """Fit the numbers of a telescope to the stamps of its stars.
 
-    The fit uses the 500 stars with the most light over the sky noise that a mode explains, or all
-    of them if there are fewer.
+    The fit uses the stars that a mode explains; of more than 500, those of the highest flux over
+    sky noise.
 
     Parameters
     ----------
     search : WavefrontSearch
         Search that has the counts and fluxes of all stars.
     modes : StarModes
-        Modes of the single stars; stars that no mode explains are not used.
+        Modes of the individual stars; stars that no mode explains are not used.
     model : TelescopeModel
         Model of all stars of the search.
 
@@ -242,15 +245,15 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
     """
     if not model.sd.size:
         raise SensingError("the prior fixes all numbers of the telescope: there is nothing to fit")
-    # The 500 explained stars with the most light in units of the sky noise: the time grows with
+    # The 500 explained stars of the highest flux over sky noise; the computing time grows with
     # their number.
     optics, best_modes = search.optics, modes.best_modes
     best_modes = best_modes.select(search.is_explained(best_modes))
     stars = best_modes.star
     # Flux is the last but one parameter of a mode, in units of `search.flux`.
-    light = search.flux[stars] * best_modes.parameters[:, -2]
-    light = light / np.sqrt(search.photons.sky_counts[stars])
-    stars = np.sort(stars[np.argsort(-light, kind="stable")[:500]])
+    flux_over_noise = search.flux[stars] * best_modes.parameters[:, -2]
+    flux_over_noise = flux_over_noise / np.sqrt(search.photons.sky_counts[stars])
+    stars = np.sort(stars[np.argsort(-flux_over_noise, kind="stable")[:500]])
     if stars.size * 2 < model.sd.size or not stars.size:
         raise SensingError(
             f"{stars.size} stars that a wavefront explains are too few for "
@@ -258,7 +261,8 @@ def fit_telescope(search: WavefrontSearch, modes: StarModes, model: TelescopeMod
         )
     modes = modes.select_stars(stars)
     posterior = TelescopePosterior(search, model, stars, optics)
-    # Two starts: near the prior mean, and near its twin, unless rays cannot pass that telescope.
+    # Two starts: near the prior mean, and near the twin of the first start, unless rays cannot pass
+    # the twin.
     q = posterior.number_count
     starts = [start_near(posterior, modes, np.zeros(q))]
     with suppress(RayTracingError):
@@ -290,7 +294,7 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     posterior : TelescopePosterior
         Posterior of the numbers.
     peaks : Peaks
-        Ends of the climbs from both starts, which may coincide.
+        Maxima reached from both starts; they may coincide.
     """
     model, star = posterior.model, posterior.star
     t = peaks.parameters[:, : posterior.number_count]
@@ -298,17 +302,18 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
     best_peak = int(log_evidence.argmax())
     number_covariance = covariance[best_peak, : t.shape[1], : t.shape[1]]
     sigma = np.sqrt(np.diagonal(number_covariance))
-    # Peaks more than a standard deviation from the best one share the probability.
+    # A peak farther than a standard error from the best one in any number is a twin; the others are
+    # the same peak.
     twins = np.flatnonzero(np.abs((t - t[best_peak]) / sigma).max(axis=1) > 1)
-    # Masses relative to the best peak.
-    mass = np.exp(log_evidence - log_evidence[best_peak])
+    # Evidence relative to the evidence of the best peak.
+    relative_evidence = np.exp(log_evidence - log_evidence[best_peak])
     deviance = posterior.evaluate_stars(peaks.parameters[best_peak])[0]
     return Joint(
         model,
         value=model.mean + model.sd * t[best_peak],
         error=model.sd * sigma,
         correlation=number_covariance / sigma / sigma[:, None],
-        probability=float(1.0 / (1.0 + mass[twins].sum())),
+        probability=float(1.0 / (1.0 + relative_evidence[twins].sum())),
         twin=model.mean + model.sd * t[twins[0]] if twins.size else None,
         star=star,
         disagrees=deviance > posterior.search.photons.deviance_limit[star],
@@ -316,7 +321,7 @@ def summarise_peaks(posterior: TelescopePosterior, peaks: Peaks) -> Joint:
 
 
 def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -> np.ndarray:
-    """Return parameters that agree with the modes of the single stars, near t (Q,).
+    """Return parameters near t (Q,) that agree with the modes of the individual stars.
 
     In each round the mode nearest to the telescope is chosen for every star, and the numbers are
     fitted to the chosen modes, weighted by their inverse covariance.
@@ -328,7 +333,7 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
     modes : StarModes
         All modes of the stars of the posterior.
     t : ndarray, shape (Q,)
-        Standardised numbers of the first telescope.
+        Standardised numbers from which the first round starts.
 
     Returns
     -------
@@ -336,8 +341,8 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
         Standardised numbers of the telescope, then position, flux and sky of the chosen mode of
         each star.
     """
-    # Coefficients of all modes in waves, with their covariance; a small diagonal is added to it for
-    # coefficients that the prior fixes.
+    # Coefficients of all modes in waves, with their covariance. Its diagonal is increased by 1e-6
+    # waves², because the variance of coefficients that the prior fixes is 0.
     optics = posterior.search.optics
     count, sd = optics.coefficient_count, optics.terms.sd[modes.star]
     mode_coefficients = optics.coefficients(modes.star, modes.parameters[:, :count])
@@ -349,32 +354,33 @@ def start_near(posterior: TelescopePosterior, modes: StarModes, t: np.ndarray) -
     for _ in range(4):
         # Squared Mahalanobis distance of each mode; in this order, the first mode of each star is
         # the nearest.
-        gap = mode_coefficients - posterior.coefficients(t)[row]
-        order = np.lexsort((compute_squared_distance(gap[:, None], covariance)[:, 0], modes.star))
+        residual = mode_coefficients - posterior.coefficients(t)[row]
+        distance2 = compute_squared_distance(residual[:, None], covariance)[:, 0]
+        order = np.lexsort((distance2, modes.star))
         nearest = order[np.flatnonzero(np.diff(modes.star[order], prepend=-1))]
         # Gauss–Newton step of the numbers, with their prior.
         slopes = posterior.slopes(t)
         weighted_slopes = slopes @ np.linalg.inv(covariance[nearest])
         information = (weighted_slopes @ slopes.swapaxes(1, 2)).sum(axis=0) + np.eye(t.size)
-        score = (weighted_slopes @ gap[nearest][:, :, None]).sum(axis=0)[:, 0] - t
+        score = (weighted_slopes @ residual[nearest][:, :, None]).sum(axis=0)[:, 0] - t
         t = np.clip(t + np.linalg.solve(information, score), -MAX_Z, MAX_Z)
     return np.concatenate([t, modes.parameters[nearest, count:].ravel()])
 
 
 def twin_numbers(posterior: TelescopePosterior, t: np.ndarray) -> np.ndarray:
-    """Return standardised numbers with the coefficients of t (Q,), but even ones negated.
+    """Return standardised numbers of the twin of t (Q,), whose even coefficients are negated.
 
-    Even terms are equal at opposite points of the pupil. It is a least-squares solution by
-    Gauss–Newton steps, because often no telescope has exactly these coefficients.
+    Even terms have the same value at opposite points of the pupil. The numbers are a least-squares
+    solution by Gauss–Newton steps, because often no telescope has exactly these coefficients.
     """
     is_even = posterior.search.optics.terms.is_even
     # Target coefficients of the twin; coefficients of odd terms do not change.
     target = np.where(is_even, -1.0, 1.0) * posterior.coefficients(t)
     # Few steps are enough: coefficients are linear in the numbers, or nearly so.
     for _ in range(4):
-        # All coefficients of all stars are equations for the numbers. Singular values below 1e-9 of
-        # the largest belong to combinations of numbers that change no coefficient.
+        # Each coefficient of each star is an equation for the numbers. Singular values below 1e-9
+        # of the largest belong to combinations of numbers that change no coefficient.
         slopes = posterior.slopes(t).transpose(1, 0, 2).reshape(t.size, -1)
-        gap = (target - posterior.coefficients(t)).ravel()
-        t = np.clip(t + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0], -MAX_Z, MAX_Z)
+        residual = (target - posterior.coefficients(t)).ravel()
+        t = np.clip(t + np.linalg.lstsq(slopes.T, residual, rcond=1e-9)[0], -MAX_Z, MAX_Z)
     return t

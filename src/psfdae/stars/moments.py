@@ -3,10 +3,9 @@
 Inputs: stamps of stars, (n, s, s). Outputs: one value for each star, or shifted stamps.
 
 Sizes and shapes are the moments of a PSF under an elliptical Gaussian weight that is matched to
-them (Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the
-ellipse of the Gaussian that fits the PSF best. Unlike plain second moments they do
-not depend on the wings and the edge of the stamp, and unlike a contour at half the
-maximum they do not depend on a few pixels.
+them (Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the ellipse of
+the Gaussian that fits the PSF best. They depend less on the wings and the edge of the stamp than
+unweighted second moments, and less on single pixels than a contour at half the maximum.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SIGMA_OF_MAD = 1.4826
-"""Ratio of the standard deviation of a normal variable to the median of its modulus."""
+"""Ratio of the standard deviation of a normal variable to its median absolute deviation."""
 
 FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 """Ratio of the FWHM of a Gaussian to its standard deviation."""
@@ -24,9 +23,8 @@ FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 def robust_scatter(values: np.ndarray) -> np.ndarray:
     """Return the standard deviation along the first axis, from the median absolute deviation."""
-    # 1.4826 times the median deviation is σ of a normal distribution.
-    middle = np.median(values, axis=0)
-    return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
+    median = np.median(values, axis=0)
+    return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - median), axis=0))
 
 
 def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
@@ -35,11 +33,11 @@ def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarr
     Parameters
     ----------
     values, label : ndarray, shape (…)
-        Numbers, and the label of each, a whole number from 0 to at most 32,767.
+        Values, and the label of each, an integer from 0 to at most 32,767.
     count : int
         Number of labels.
     """
-    # Small whole numbers are sorted by digits, in a fraction of the time of sorting the values.
+    # A stable sort of 16-bit integers is a radix sort, much faster than a sort of the values.
     label = label.ravel().astype(np.int16)
     groups = np.split(
         values.ravel()[np.argsort(label, kind="stable")],
@@ -54,7 +52,8 @@ def count_step(values: np.ndarray) -> float:
     The step is the smallest difference of two values, in the unit of the pixels. The result is 0
     where the noise is wider or pixels are not quantised. Pixels that are not finite are ignored.
     """
-    # At most 2 million pixels. Differences of neighbours in a row hardly contain starlight.
+    # At most 2 million pixels of evenly spaced rows. Differences of neighbours in a row contain
+    # little starlight; their scatter is √2 σ.
     sample = values[:: len(values) * values.shape[1] // 2_000_000 + 1]
     distinct = np.unique(sample[np.isfinite(sample)])
     differences = np.diff(sample, axis=1)
@@ -68,7 +67,7 @@ def count_step(values: np.ndarray) -> float:
 def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
     """Return pixels (…, m, n) with uniform noise of ± one step, and the variance of this noise.
 
-    The median of whole counts is a whole number, whatever the level and the scatter of the sky.
+    The median of integer counts is an integer for every level and scatter of the sky.
     With this noise, which is the same in every call, medians, modes and clipped deviations differ
     by less than 0.2 σ from their values before rounding, for a noise of 0.3 steps or more.
     """
@@ -80,15 +79,18 @@ def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
 
 
 def remove_dither(sigma: np.ndarray, variance: float) -> np.ndarray:
-    """Return σ of dithered pixels without the variance of `dither`, but for its rounding part."""
-    # The variance of rounding, step²/12, is a quarter of the dither's, step²/3, and remains.
+    """Return σ of dithered pixels without the variance that `dither` added.
+
+    The result is at least the rounding error of the pixels, step/√12.
+    """
+    # The variance of rounding, step²/12, is a quarter of the variance of the dither, step²/3.
     return np.sqrt(np.maximum(sigma**2 - variance, variance / 4.0)) if variance else sigma
 
 
 def shift_stamps(
     stamps: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return stamps shifted by cubic splines, their edge pixels repeated outside.
+    """Return stamps shifted by cubic splines, with edge pixels repeated outside the stamp.
 
     The mean squared error is 1e-8 for a star of flux 1 with a FWHM of 3 px.
 
@@ -97,7 +99,7 @@ def shift_stamps(
     stamps : ndarray, shape (n, s, s)
         Images of stars.
     shift : ndarray, shape (m, 2)
-        Shift of the star along rows and columns, in pixels.
+        Shift of the star along the row and column axes, in pixels.
     stamp : ndarray of int, shape (m,), optional
         Index of the stamp of each shift; by default each stamp is shifted once, m = n.
 
@@ -108,7 +110,8 @@ def shift_stamps(
     """
     from scipy import ndimage
 
-    # Edges farther than a margin of 12 px have no influence on a spline inside.
+    # The influence of the edge on the splines decreases by a factor of 3.7 per pixel, to 1e-7 after
+    # a margin of 12 px.
     side, margin = stamps.shape[-1], 12
     # One set of splines per stamp, however often the stamp is shifted.
     stamp = np.arange(len(stamps)) if stamp is None else stamp
@@ -139,11 +142,11 @@ def cubic_splines(
     position : ndarray, shape (…)
         Positions in pixels.
     knots : int
-        Number of equidistant knots; position 0 lies in their middle.
+        Number of equidistant knots; position 0 is in the middle between the first and the last.
     spacing : float
         Distance of two knots in pixels.
     slope : bool
-        Return slopes per pixel.
+        True for slopes per pixel instead of values.
 
     Returns
     -------
@@ -164,11 +167,12 @@ def cubic_splines(
         u = 1 - t
         values = (u**3, 4 - 3 * t**2 * (1 + u), 4 - 3 * u**2 * (1 + t), t**3)
         scale = 6.0
-    # Four more knots on each side hold values of knots that do not exist; they are cut off.
+    # Four additional knots on each side take the values that belong to knots outside the range;
+    # they are cut off.
     count = knots + 8
     matrix = np.zeros((*position.shape, count))
     knot = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
-    # Index of the first of the four knots of each position, all knots in one row.
+    # Index, in the flattened matrix, of the first of the four knots of each position.
     index = np.arange(position.size).reshape(position.shape) * count + knot + 3
     for number, value in enumerate(values):
         matrix.reshape(-1)[index + number] = value / scale
@@ -176,7 +180,7 @@ def cubic_splines(
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
-    """Return matrices (n, s, s) that shift the pixels of an axis by n steps; 0 outside."""
+    """Return matrices (n, s, s) that shift the pixels of an axis by n steps in px; 0 outside."""
     from scipy import ndimage
 
     # A shifted image of a single pixel is a column of the matrix.
@@ -194,18 +198,18 @@ def find_centroids(
     stamps : ndarray, shape (n, s, s)
         Sky-subtracted images of stars.
     start : ndarray, shape (n, 2)
-        First estimate (row, column) from index (s//2, s//2).
+        First estimate (row, column), in pixels from index (s//2, s//2).
     window_px : ndarray, shape (n,)
-        σ of the window in pixels, similar to the star's.
+        σ of the window in pixels, about the σ of the star.
     rounds : int
-        Number of iterations; each reduces the distance to less than a fifth.
+        Number of iterations; each reduces the distance to the centroid to less than a fifth.
     reach_px : float
         Largest distance from the start, per axis, in pixels.
 
     Returns
     -------
     ndarray, shape (n, 2)
-        (row, column) from index (s//2, s//2).
+        (row, column), in pixels from index (s//2, s//2).
     """
     # A Gaussian window is a product of Gaussians along rows and along columns.
     axis = np.arange(stamps.shape[-1]) - stamps.shape[-1] // 2
@@ -213,12 +217,17 @@ def find_centroids(
     for _ in range(rounds):
         rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
         along = [np.exp(-0.5 * (a / window_px[:, None]) ** 2) for a in (rows, columns)]
-        light = along[0][:, :, None] * along[1][:, None, :] * stamps
+        weighted_light = along[0][:, :, None] * along[1][:, None, :] * stamps
         # First moments of the light under the window.
-        total = light.sum(axis=(1, 2))
-        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
-        # A window as wide as the star halves the distance of the centroid, hence the 2.
-        step = 2.0 * np.stack(moments, axis=1) / np.where(total > 0, total, np.inf)[:, None]
+        total = weighted_light.sum(axis=(1, 2))
+        row_moment = np.einsum("nij,ni->n", weighted_light, rows)
+        column_moment = np.einsum("nij,nj->n", weighted_light, columns)
+        # A window as wide as the star halves the distance of the centroid, hence the factor of 2.
+        step = (
+            2.0
+            * np.stack([row_moment, column_moment], axis=1)
+            / np.where(total > 0, total, np.inf)[:, None]
+        )
         centre = np.clip(centre + step, start - reach_px, start + reach_px)
     return centre
 
@@ -230,11 +239,11 @@ class Shapes:
     Attributes
     ----------
     fwhm_px : ndarray, shape (n,)
-        2 √(2 ln 2) · |M|^¼ of the moments M, in pixels; it includes the width of the pixel.
+        2 √(2 ln 2) · |M|^¼ of the moments M, in pixels; the pixel broadens it.
     ellipticity : ndarray, shape (n,)
-        1 − b/a of the axes of the ellipse.
+        1 − b/a with the semi-axes a ≥ b of the ellipse.
     position_angle_deg : ndarray, shape (n,)
-        Angle of the major axis from +x (columns) towards +y (rows), −90 … 90.
+        Angle of the major axis from +x (columns) towards +y (rows), −90° … 90°.
     """
 
     fwhm_px: np.ndarray
@@ -262,20 +271,20 @@ def measure_shapes(psf: np.ndarray) -> Shapes:
 
 def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
     """Return the moments M_xx, M_xy, M_yy under a matched Gaussian weight, shape (3, n)."""
-    # In single precision, with the brightest pixel 1.
+    # In single precision; the brightest pixel is scaled to 1.
     count, side = len(psf), psf.shape[-1]
     light = np.maximum(psf.reshape(count, -1), 0.0).astype(np.float32)
     peak = light.max(axis=1, initial=0.0)
     # PSFs without light are replaced by flat ones here, and become NaN at the end.
-    lit = np.isfinite(peak) & (peak > 0)
-    light /= np.where(lit, peak, 1.0)[:, None]
-    light[~lit] = 1.0
+    has_light = np.isfinite(peak) & (peak > 0)
+    light /= np.where(has_light, peak, 1.0)[:, None]
+    light[~has_light] = 1.0
     # Terms 1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²).
     row, column = (axis.ravel() for axis in np.indices((side, side)) - 0.5 * (side - 1))
     terms = np.stack(
         [np.ones_like(row), column, row, column * column, column * row, row * row]
     ).astype(np.float32)
-    # Unweighted moments to start with.
+    # Start with unweighted moments.
     x, y, moments = _centre_and_moments(light @ terms.T)
     moments = _bound_moments(*moments, side)
     weighted_light = np.empty_like(light)
@@ -291,38 +300,40 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
         moments = _bound_moments(*_correct_moments(apparent, weight), side)
         centre = _correct_centre(x, y, x1, y1, apparent, moments)
         x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in centre)
-    return np.where(lit, np.array(moments), np.nan)
+    return np.where(has_light, np.array(moments), np.nan)
 
 
 Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Elements xx, xy, yy of n symmetric matrices."""
+"""Elements xx, xy, yy of n symmetric 2 × 2 matrices, in px²."""
 
 
 def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matrix]:
     """Return x, y and central second moments from sums of 1, x, y, x², xy and y², (n, 6)."""
-    # Means of x, y and their products; the central ones follow.
+    # Means of x, y, x², xy and y²; then the central moments, such as ⟨x²⟩ − ⟨x⟩².
     total = np.maximum(sums[:, 0].astype(np.float64), 1e-30)
     x, y, xx, xy, yy = sums[:, 1:].T / total
     return x, y, (xx - x * x, xy - x * y, yy - y * y)
 
 
 def _correct_moments(apparent: Matrix, weight: Matrix) -> Matrix:
-    """Return the moments T + T(W − T)⁻¹T of the Gaussian with moments T under the weight W.
+    """Return the moments T + T(W − T)⁻¹T of the Gaussian that has moments T under the weight W.
 
     The result is 2 T where no such Gaussian exists, because the PSF is flat.
     """
     # Elements of W − T, and T (W − T)⁻¹ T written out.
     a, b, c = (w - t for w, t in zip(weight, apparent, strict=True))
     determinant = a * c - b * b
-    gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
-    determinant = np.where(gaussian, determinant, 1.0)
+    is_gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
+    determinant = np.where(is_gaussian, determinant, 1.0)
     xx, xy, yy = apparent
     correction = (
         (xx * xx * c - 2.0 * xx * xy * b + xy * xy * a) / determinant,
         (xx * xy * c - (xx * yy + xy * xy) * b + xy * yy * a) / determinant,
         (xy * xy * c - 2.0 * xy * yy * b + yy * yy * a) / determinant,
     )
-    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(apparent, correction, strict=True))
+    xx, xy, yy = (
+        t + np.where(is_gaussian, m, t) for t, m in zip(apparent, correction, strict=True)
+    )
     return xx, xy, yy
 
 
@@ -331,7 +342,7 @@ def _correct_centre(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the centre c + M T⁻¹ (c₁ − c) of a Gaussian of moments M.
 
-    Its centre under a weight about c is c₁ = (x1, y1), with the moments T = `weighted`.
+    Its centre under a weight about c is c₁ = (x1, y1), with the moments T = `apparent`.
     """
     xx, xy, yy = apparent
     # (u, v) = T⁻¹ (c₁ − c).
@@ -342,7 +353,7 @@ def _correct_centre(
 
 
 def _bound_moments(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
-    """Limit moments to the range from a pixel to the stamp, and to ellipses with real axes."""
+    """Limit moments to widths between a pixel and the stamp, and to positive determinants."""
     # The variance of a pixel of side 1 is 1/12 ≈ 0.08 px² along an axis.
     xx, yy = (np.clip(variance, 0.08, (0.5 * side) ** 2) for variance in (xx, yy))
     limit = 0.99 * np.sqrt(xx * yy)
@@ -353,7 +364,8 @@ def _exponent(
     x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray
 ) -> np.ndarray:
     """Return the coefficients of 1, x, y, x², xy and y² in the exponent of the weight, (n, 6)."""
-    # −½ (a (x−x₀)² + 2b (x−x₀)(y−y₀) + c (y−y₀)²) with the inverse (a, b; b, c) of the moments.
+    # −½ (a (x−x₀)² + 2b (x−x₀)(y−y₀) + c (y−y₀)²) with the inverse (a, b; b, c) of the moments;
+    # the centre (x₀, y₀) is the arguments x and y.
     determinant = xx * yy - xy**2
     a, b, c = yy / determinant, -xy / determinant, xx / determinant
     constant = a * x * x + 2.0 * b * x * y + c * y * y

@@ -1,4 +1,4 @@
-"""Training and measurement of one point of a sweep over a method's settings.
+"""Training and evaluation of one point of a sweep over a method's settings.
 
 Inputs: the point's configuration and the product "stars". Outputs: the method's fit, as the stage
 `fit` makes it, and its errors on validation and test stars.
@@ -39,14 +39,14 @@ def measure(config: Config, task: Task, model: str) -> Measurement:
     config : Config
         Configuration of the point.
     task : Task
-        Path of the product "stars", split and reference, noise levels and output folder.
+        Path of the product "stars", split and reference images, noise levels and output folder.
     model : str
         Name of the method.
 
     Returns
     -------
     Measurement
-        Metrics of validation and test stars, settings, seconds and epochs.
+        Metrics on validation and test stars, settings, duration in seconds, and epochs.
 
     Raises
     ------
@@ -57,28 +57,28 @@ def measure(config: Config, task: Task, model: str) -> Measurement:
     settings = part(list_groups(model), config)
     stars, out = task.data["stars"], locate_fit(method_class, task.folder)
     limit_threads(method_class.threads(settings))
-    # Errors on validation stars need a fit without them. Some methods leave them out, or use
-    # them only to stop the training; the others are fitted to them in the main workflow.
+    # Errors on validation stars need a fit without these stars. Methods that need validation stars
+    # are not fitted to them, or use them only to stop the training; the main workflow fits all
+    # other methods to them.
     validation_fit = None
     if not method_class.needs.validation:
         product = read_stars(stars, fits.get_training_reference(method_class, task.reference))
         data = training_set(settings, method_class, product, task.split, task.reference)
         validation_fit = method_class.fit(data.drop_validation(), **method_class.settings(settings))
-    # The fit of the main workflow, with its cost.
+    # The same fit as in the main workflow, with its elapsed and CPU time.
     start_s, start_cpu_s = time.monotonic(), time.process_time()
-    key = task.split, task.reference
-    fit(settings, model, stars, *key, checkpoint=task.checkpoint, out=out)
+    fit(settings, model, stars, task.split, task.reference, checkpoint=task.checkpoint, out=out)
     seconds, cpu_seconds = time.monotonic() - start_s, time.process_time() - start_cpu_s
-    # Errors on both parts, and how the training ended.
+    # Errors on validation and test stars.
     limit_threads(config.evaluation.threads)
     estimator = method_class.load(out, task.reference, config.evaluation)
     metrics = measure_images(config, task, model, validation_fit or estimator, estimator)
-    # Settings of the fit; the start that succeeded is a result.
+    # Settings of the fit; the number of the attempt that succeeded is a result, not a setting.
     fit_config = method_class.read_config(out)
     attempt = fit_config.pop("attempt", 0)
     epochs, is_stopped = None, False
     if HISTORY in fits.get_storage(method_class).diagnostics:
-        # The history has the duration of the training, with all parts of an interrupted one.
+        # The history has the time of the whole training, also if it was interrupted and resumed.
         last_epoch = read_table(fits.path_beside(method_class, out, HISTORY)).iloc[-1]
         seconds, cpu_seconds = float(last_epoch["seconds"]), float(last_epoch["cpu_seconds"])
         # Fewer epochs than allowed: the training was stopped early.

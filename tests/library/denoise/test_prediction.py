@@ -305,6 +305,12 @@ def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs
     assert has(clean, unlike_flags).mean() < 0.02
 
 
+def test_a_model_without_a_field_has_no_range_of_magnitudes(shipped):
+    """As for every model whose PSF does not change with the magnitude: None, no error."""
+    assert not shipped.method.knows_field
+    assert shipped.magnitude_range is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -266,6 +266,22 @@ def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    "arguments",
+    [
+        {"x": [1.0, 2.0, 3.0], "y": [1.0, 2.0]},
+        {"x": [1.0, 2.0], "y": 1.0, "mag": [-9.0, -9.0, -9.0]},
+        {"x": [[1.0]], "y": [[2.0]]},
+        {"x": np.nan, "y": 1.0},
+        {"x": 1.0, "y": 1.0, "colour": np.inf},
+    ],
+)
+def test_positions_of_different_lengths_or_not_finite_raise_one_line(arguments):
+    """The message names the arguments; numpy's error on shapes that do not fit names none."""
+    with pytest.raises(PredictionError, match=r"x, y, mag and colour must be finite.*same length"):
+        Moving().psf_at(**arguments)
+
+
+@pytest.mark.parametrize(
     ("key", "value", "message"),
     [
         ("EXTNAME", "OTHER", "PSF_DATA"),

@@ -1,10 +1,10 @@
 """Fits of stars in the nodes of the lattice of centres: flux, sky and centre in each pair.
 
 Inputs: stamps with the known quantities of each star (`FieldStamps`), and the `FieldPrior`.
-`project_pairs` reduces each pair of a star and a node to products along the axes of the node, which
-are valid for noise of any variance (eq. 8). `fit_pairs` computes the marginal likelihood and the
-flux in each pair for the noise of the star, with sky and centre marginalised (eq. 9 to 11).
-Equations are numbered as on the page docs/field_model.md.
+`project_pairs` reduces each pair of a star and a node to projections on the axes of the node, and
+products in their orthogonal complement, which are valid for any noise variance (eq. 8). `fit_pairs`
+computes the marginal likelihood and the flux in each pair for the noise of the star, with sky and
+centre marginalised (eq. 9 to 11). Equations are numbered as on the page docs/field_model.md.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ class FieldStamps(NamedTuple):
     images : ndarray, shape (n, P)
         Stamps with the sky roughly subtracted, or exactly where `sky_known`.
     noise : ndarray, shape (n,)
-        RMS of the noise of a pixel.
+        RMS of the noise of a pixel, in the unit of the images.
     terms : ndarray, shape (n, K)
         Terms of the field at the positions of the stars.
     log_prior : ndarray, shape (n, nodes)
         ln of the probability of each node; −inf for impossible nodes.
     flux : ndarray, shape (n,)
-        Known fluxes; NaN where the flux is measured.
+        Known fluxes, in the unit of the images; NaN where the flux is measured.
     sky_known : ndarray of bool, shape (n,)
-        True where the sky is exactly subtracted.
+        True where the sky is known and exactly subtracted.
     unit_per_electron : ndarray, shape (n,)
-        Value of an electron in units of the images; 0 where unknown.
+        Value of an electron in the unit of the images, 1/gain; 0 where unknown.
     cell_sigma_px : ndarray, shape (n,)
         σ of a centre about its node, along each axis, in pixels; 0 where the centre is known.
     unit : ndarray, shape (n,)
-        Guess of the flux, by which stars are divided in their fit.
+        Guess F of the flux, in the unit of the images; the fit divides the stars by it.
     position_known : bool
         True if the positions of all stars are known, False if they are all unknown.
     centre : ndarray, shape (n, 2), or None
-        (row, column) from the middle pixel if all centres are exactly known.
+        (row, column) in pixels from the middle pixel, if all centres are exactly known.
     """
 
     images: np.ndarray
@@ -64,11 +64,11 @@ class FieldStamps(NamedTuple):
         return FieldStamps._make(a[stars] if isinstance(a, np.ndarray) else a for a in self)
 
     def prior_sigma(self) -> np.ndarray:
-        """Return the prior σ of t: sky (over flux), row and column, (n, 3) (eq. 6).
+        """Return the prior σ of t: sky over flux, row and column in pixels, (n, 3) (eq. 6).
 
-        It is 1 for an unknown sky, the whole flux in each pixel, and 0 for known quantities.
+        σ of an unknown sky is 1, the whole flux in each pixel; σ of known quantities is 0.
         """
-        # In the order of the derivatives of a node.
+        # In the order of the derivatives of a node: sky, row, column.
         return np.stack([~self.sky_known * 1.0, self.cell_sigma_px, self.cell_sigma_px], axis=1)
 
     def psfs(self, prior: FieldPrior, k: int, stars: np.ndarray) -> np.ndarray:
@@ -90,16 +90,17 @@ class FieldStamps(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs of a star x and a node with its PSF m, N of them, in the order of the nodes.
+    """N pairs of a star x and a node with its PSF m, in the order of the nodes.
 
     Attributes
     ----------
     star, node : ndarray of int, shape (N,)
         Indices of the star and the node of each pair.
     along : ndarray, shape (N, 2, m)
-        x and m along the axes of the node.
+        Projections of x and m on the axes of the node.
     products_beyond : ndarray, shape (N, 2, 5)
-        Products of x and m with x, m and the three derivatives, beyond the axes.
+        Scalar products of x and m with x, m and the three derivatives, in the orthogonal
+        complement of the axes.
     """
 
     star: np.ndarray
@@ -113,7 +114,7 @@ class Pairs(NamedTuple):
 
     def iterate_nodes(self) -> Iterator[tuple[int, slice]]:
         """Yield the index of each node, and the slice of its pairs."""
-        # Pairs of a node are neighbours.
+        # Pairs of the same node follow each other.
         nodes, first = np.unique(self.node, return_index=True)
         for k, start, stop in zip(nodes.tolist(), first, [*first[1:], len(self.node)], strict=True):
             yield k, slice(start, stop)
@@ -125,7 +126,7 @@ class PairFit(NamedTuple):
     Attributes
     ----------
     log_likelihood : ndarray, shape (N,)
-        ln of the marginal likelihood, without (2π)^(P/2) (eq. 11).
+        ln of the marginal likelihood, without the factor (2π)^(−P/2) (eq. 11).
     factor : ndarray, shape (N,)
         Posterior mean of the factor a (eq. 10).
     variance : ndarray, shape (N,)
@@ -135,7 +136,8 @@ class PairFit(NamedTuple):
     covariance : ndarray, shape (N, 3, 3)
         Λ⁻¹.
     nuisance : ndarray, shape (N, 2, 3)
-        Mean of t/σ in a fit to x and in a fit to m; the mean for x − a m is x's minus a times m's.
+        Mean of t/σ in a fit to x, and in a fit to m. The mean in a fit to x − a m is the first
+        minus a times the second.
     """
 
     log_likelihood: np.ndarray
@@ -146,7 +148,7 @@ class PairFit(NamedTuple):
     nuisance: np.ndarray
 
     def nuisance_and_slope(self, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return t of x − a m, (N, 3), and its derivative t' by a, for prior σ (N, 3) (eq. 13)."""
+        """Return t of x − a m, (N, 3), and its derivative dt/da, for prior σ (N, 3) (eq. 13)."""
         # t/σ is linear in the data.
         difference = self.nuisance[:, 0] - self.factor[:, None] * self.nuisance[:, 1]
         return sigma * difference, -sigma * self.nuisance[:, 1]
@@ -157,9 +159,10 @@ class PairFit(NamedTuple):
 
 
 def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) -> Pairs:
-    """Return stars and PSFs along the axes of each nearby node, and products beyond them.
+    """Project stars and PSFs on the axes of each nearby node, and on their complement.
 
-    Products with G⁻¹ are sums over the axes and one term beyond them, for any noise (eq. 8):
+    For any noise variance s, a product with G⁻¹ is a sum over the axes (columns of V, variances λ)
+    and one term for their orthogonal complement, of variance λ₀ (eq. 8):
     xᵀ G⁻¹ y = Σ (Vᵀx)(Vᵀy)/(λ + s) + (xᵀy − Σ (Vᵀx)(Vᵀy))/(λ₀ + s).
 
     Parameters
@@ -169,7 +172,7 @@ def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) 
     stars : FieldStamps
         Stamps of n stars.
     is_nearby : ndarray of bool, shape (n, nodes)
-        True for nodes in which a star is fitted.
+        True for the nodes at which a star is fitted.
     """
     # Pairs in the order of the nodes; all nodes have the same number of axes.
     node, star = is_nearby.T.nonzero()
@@ -179,14 +182,15 @@ def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) 
     for k, rows in pairs.iterate_nodes():
         derivatives, axes = prior.nodes[k].derivatives, prior.node_axes(k, stars.position_known)
         image, mean = images[star[rows]], stars.psfs(prior, k, star[rows])
-        # x and m along the axes; m is a sum of the node's images, whose products are stored.
+        # x and m along the axes. m is a weighted sum of the node's images, whose projections on the
+        # axes (`axes.images`) are stored.
         along, products = pairs.along[rows], pairs.products_beyond[rows]
         along[:, 0] = image @ axes.basis[3:].T
         if stars.centre is None:
             along[:, 1] = prior.nodes[k].image_weights(stars.terms[star[rows]]) @ axes.images
         else:
             along[:, 1] = mean @ axes.basis[3:].T
-        # Products over all pixels, minus products along the axes.
+        # Products in the complement: products over all pixels minus products along the axes.
         products[:, 0, 0] = square[star[rows]]
         products[:, 0, 1] = products[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
         products[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
@@ -196,7 +200,7 @@ def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) 
 
 
 def fit_pairs(prior: FieldPrior, stars: FieldStamps, pairs: Pairs) -> PairFit:
-    """Return the fit of stars, divided by their guessed flux, in their nodes (eq. 9 to 11)."""
+    """Fit stars, divided by their guessed fluxes, at their nodes (eq. 9 to 11)."""
     count, s = len(pairs.star), stars.noise_variance()[pairs.star]
     scale, sigma = 1.0 / stars.unit[pairs.star, None], stars.prior_sigma()[pairs.star]
     products, precision, log_det = (np.empty((count, *shape)) for shape in ((2, 5), (3, 3), ()))
@@ -208,10 +212,11 @@ def fit_pairs(prior: FieldPrior, stars: FieldStamps, pairs: Pairs) -> PairFit:
         products[rows] = _products(along * inverse[:, None, :-1], along, axes.derivatives)
         products[rows] += inverse[:, -1, None, None] * pairs.products_beyond[rows]
         precision[rows] = axes.nuisance_precision(s[rows], sigma[rows])
-        # `inverse` has one entry for the dimensions beyond the axes; the others are added here.
+        # The last entry of `inverse` is 1/(λ₀ + s), for all P − m dimensions of the complement; the
+        # sum has one of them, and the others are added here.
         dimensions = stars.images.shape[1] - inverse.shape[1]
         log_det[rows] = -np.log(inverse).sum(axis=1) - dimensions * np.log(inverse[:, -1])
-    # From here on, stars are x/F and derivatives are σ L.
+    # From here on, x is divided by F, and the derivatives L are multiplied by σ.
     products[:, 0] *= scale
     products[:, :, 0] *= scale
     products[:, :, 2:] *= sigma[:, None]
@@ -220,8 +225,8 @@ def fit_pairs(prior: FieldPrior, stars: FieldStamps, pairs: Pairs) -> PairFit:
     nuisance = products[:, :, 2:] @ covariance
     products[:, :, :2] -= nuisance @ products[:, :, 2:].transpose(0, 2, 1)
     (xx, xm), (_, mm) = products[:, :, :2].transpose(1, 2, 0)
-    # Generalised least squares for a with a prior about 1 (eq. 10): the product of the residual
-    # x − m with m, over the information.
+    # Generalised least squares for a with a prior of mean 1 (eq. 10): a − 1 is mᵀS⁻¹(x − m) over
+    # the information mᵀS⁻¹m + 1/τ².
     flux_precision = stars.flux_precision()[pairs.star]
     information, residual = mm + flux_precision, xm - mm
     chi2 = xx - xm - residual - residual**2 / information
@@ -236,12 +241,12 @@ def fit_pairs(prior: FieldPrior, stars: FieldStamps, pairs: Pairs) -> PairFit:
 
 
 def _products(factors: np.ndarray, along: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
-    """Return products of two weighted vectors with vectors and derivatives, along axes.
+    """Return weighted scalar products of x and m with x, m and the derivatives, along axes.
 
     Parameters
     ----------
     factors, along : ndarray, shape (n, 2, m)
-        x and m along the axes, multiplied by a weight of each axis, and without weight.
+        Projections of x and m on m axes: multiplied by the weight of each axis, and without it.
     derivatives : ndarray, shape (3, m)
         Derivatives of the node along the axes.
 
