@@ -1,19 +1,19 @@
 """psfdae: point spread function modelling with a denoising autoencoder.
 
-For stars of your own::
+For the stars of an image::
 
     stars = psfdae.Stars.from_image("image.fits", catalogue="stars.csv")
     model = psfdae.fit(stars, method="field")
     report = psfdae.validate(model, stars)
     model.save("image.psf.safetensors")
 
-Of a telescope that is known::
+For a telescope whose optics are known::
 
-    found = psfdae.wavefront(stamps, "telescope.yaml", field_deg=field, joint=True)
+    wavefronts = psfdae.wavefront(stamps, "telescope.yaml", field_deg=field, joint=True)
 
-`load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
-file unless it is named for that, or changes threads or random generators of the process. In a
-terminal, long calls show a bar of their progress. Refusals are of the class `Error`.
+`load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. Only calls named
+for it, such as `save`, write files; no call changes the threads or random generators of the
+process. In a terminal, long calls show a progress bar. Wrong input raises `Error`.
 """
 
 from __future__ import annotations
@@ -76,13 +76,13 @@ __all__ = [
 ]
 
 
-if not TYPE_CHECKING:  # for a type checker, a module with this function has every name
+if not TYPE_CHECKING:  # a type checker would accept any name of a module with __getattr__
 
     def __getattr__(name: str) -> object:
-        """Import a public name on first use (PEP 562): nobody waits for what is not used."""
+        """Import a public name on first use (PEP 562), so that `import psfdae` is fast."""
         if name in _MODULES:
             return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
-        # Python names the attribute that is like it, if it knows where it was looked for.
+        # With `name` and `obj`, Python suggests a similar name.
         text = f"module {__name__!r} has no attribute {name!r}"
         raise AttributeError(text, name=name, obj=sys.modules[__name__])
 

@@ -714,7 +714,7 @@ class PosteriorNetworkTraining(Training):
         """Return the random stream of a purpose."""
         return stream(self.data.seed, "posterior network", *names)
 
-    def begin(self, lr: float) -> torch.optim.Optimizer:
+    def make_optimiser(self, lr: float) -> torch.optim.Optimizer:
         """Return the optimiser: Muon for the kernels between hidden features, else Adam."""
         inner = [*self.model.expand, *self.model.reduce]
         others = [p for p in self.model.parameters() if all(p is not w for w in inner)]

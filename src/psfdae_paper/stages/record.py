@@ -34,7 +34,7 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.source import cpu_model, git
 
 MAY_STAY = re.compile(r"(sweeps|paper)/.+")
-"""Names of products that may stay from an earlier record, because they take too long."""
+"""Names of products that may stay from an earlier record, because they take too long to compute."""
 
 
 @command("paper runtime")
@@ -44,7 +44,7 @@ def runtime(results: Folder, out: File) -> None:
     Snakemake measures wall time and memory. The CPU time of all processes of a job is in the last
     line of its log.
 
-    Columns are the rule, its wildcards, wall_s and cpu_s in seconds, and peak_mb.
+    Columns are the rule, its wildcards, wall_s and cpu_s in seconds, and peak_mb in MiB.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def runtime(results: Folder, out: File) -> None:
 
 
 def read_job_costs(results: Path) -> pd.DataFrame:
-    """Return a table with wall time, CPU time (s) and peak memory (MB) of every job.
+    """Return a table with wall time (s), CPU time (s) and peak memory (MiB) of every job.
 
     Values that are missing in Snakemake's table or in the log of a job are NaN.
 
@@ -85,7 +85,7 @@ def read_job_costs(results: Path) -> pd.DataFrame:
 
 
 def _last_run(benchmark: Path) -> pd.Series[float]:
-    """Return Snakemake's numbers of the last run of a job; ProductError if they are damaged."""
+    """Return Snakemake's row for the last run of a job; ProductError if the table is damaged."""
     return read_table(benchmark, "s", "max_rss", sep="\t", na_values=["-"]).iloc[-1]
 
 
@@ -95,11 +95,11 @@ def reference(
 ) -> None:
     """Replace the committed run of record by a finished run.
 
-    The new record belongs to the commit that is checked out. Code, workflow and settings must be as
-    committed, and Snakemake must find every file up to date with them, on whatever machine it was
-    made. Files that take long (`MAY_STAY`) and are not up to date stay from the earlier record;
-    provenance names them with the commit of that record, which must be in the history, and its
-    date.
+    The new record belongs to the commit that is checked out. Code, workflow and settings must not
+    differ from it, and Snakemake must find every file up to date with them, on whatever machine it
+    was computed. Files that take long (`MAY_STAY`) and are not up to date stay from the earlier
+    record; provenance names them with the date and the commit of the earlier record, which must be
+    in the history.
 
     The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
     from these files alone.
@@ -111,9 +111,9 @@ def reference(
     out : Path
         Folder of the run of record.
     plans : sequence of Path
-        Output of `snakemake --summary` for the files of the record.
+        Outputs of `snakemake --summary` for the files of the record.
     """
-    # The commit must be complete, and all files up to date with it.
+    # Nothing may differ from the commit, and all files must be up to date with it.
     commit = clean_commit()
     new_names = list_current_files(results, plans)
     # Files of the earlier record that stay, with its commit and date.
@@ -133,7 +133,7 @@ def reference(
         except subprocess.CalledProcessError:
             raise ProductError(
                 f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
-                " make it anew, or remove it from the record"
+                " compute it again, or remove it from the record"
             ) from None
     sources = {name: results / name for name in new_names}
     sources |= {name: out / name for name in old_records}
@@ -143,7 +143,7 @@ def reference(
     for name, path in sources.items():
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Bytes only: dates of the files are not part of the record.
+        # Contents only: dates of the files are not part of the record.
         shutil.copyfile(path, target)
     new_record = provenance(results, load()) | {"commit": commit, "kept": old_records}
     text = json.dumps(new_record, indent=2, sort_keys=True)
@@ -158,7 +158,7 @@ def clean_commit() -> str:
     Raises
     ------
     ProductError
-        If files that decide the products of a run differ from it, or git fails.
+        If files that determine the products of a run differ from it, or git fails.
     """
     # Pages, tests and tables may differ: products do not depend on them.
     try:
@@ -182,19 +182,20 @@ def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
     results : Path
         Folder of the run.
     plans : iterable of Path
-        Tables of `snakemake --summary`.
+        Outputs of `snakemake --summary`.
 
     Returns
     -------
     list of str
-        Names of files, relative to the folder.
+        Paths of files, relative to `results`.
 
     Raises
     ------
     ProductError
-        If files that may not stay from an earlier record are not up to date.
+        If files that may not stay from an earlier record are not up to date, or if the plans do not
+        contain `runtime.csv`.
     """
-    # Snakemake's plan for every file of the run: "no update", or the reason to make it.
+    # Snakemake's plan for every file of the run: "no update", or the reason for an update.
     plan_by_name: dict[str, str] = {}
     for path in plans:
         table = read_table(path, "output_file", "plan", sep="\t")
@@ -205,19 +206,18 @@ def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
         raise ProductError(
             f"{', '.join(map(str, plans)) or 'no plan'}: does not contain runtime.csv"
         )
-    # A record belongs to one commit, except files that take too long.
-    in_record = re.compile(
+    # All files of a record belong to one commit, except those that take too long.
+    record_names = re.compile(
         r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
         r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
     )
-    entries = {name: plan for name, plan in plan_by_name.items() if in_record.fullmatch(name)}
+    entries = {name: plan for name, plan in plan_by_name.items() if record_names.fullmatch(name)}
     outdated_names = {name for name, plan in entries.items() if plan != "no update"}
-    missing_names = sorted(name for name in outdated_names if not MAY_STAY.fullmatch(name))
-    if missing_names:
+    required_names = sorted(name for name in outdated_names if not MAY_STAY.fullmatch(name))
+    if required_names:
         raise ProductError(
-            f"{results / missing_names[0]}: missing, or not what this commit makes (so are"
-            f" {len(missing_names)} files of {len(entries)}); run the targets of the "
-            "record first"
+            f"{results / required_names[0]}: missing or out of date (in all {len(required_names)}"
+            f" of {len(entries)} files); run the targets of the record first"
         )
     return [name for name in entries if name not in outdated_names]
 
@@ -225,8 +225,9 @@ def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
 def provenance(results: Path, config: Config) -> dict[str, object]:
     """Describe a run: date, machine, versions, threads, and its cost.
 
-    Times are in seconds, sizes in MB. `wall_s` is the time during which jobs of `make reproduce`
-    ran, `on_request_s` the time of each further target.
+    Times are in seconds, sizes in MB, but `peak_mb` in MiB, as Snakemake measures it. `wall_s` is
+    the time during which jobs of `make reproduce` ran, `on_request_s` the time of each further
+    target.
 
     Parameters
     ----------
@@ -246,18 +247,18 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
     on_request = sorted(
         path for path in (results / "benchmarks_on_request").glob("*") if path.is_dir()
     )
-    # The last `make test` leaves its time in a report of JUnit's form.
+    # The last `make test` leaves its time in a report in JUnit's format.
     report = results / "tests.xml"
     tests = ElementTree.parse(report).getroot().find("testsuite") if report.is_file() else None
-    # Time and size of the environment that `make` created, from its files: venv writes pyvenv.cfg
-    # first, and make the other file last.
+    # Time and size of the environment that `make` created: venv writes pyvenv.cfg first, and make
+    # writes .complete last.
     environment, installation = Path(sys.prefix), {}
     start, end = environment / "pyvenv.cfg", environment / ".complete"
     if start.is_file() and end.is_file():
         seconds = end.stat().st_mtime - start.stat().st_mtime
         installation["install_s"] = round(seconds, 1)
         installation["environment_mb"] = round(_size_mb(environment), 1)
-    # Packages whose versions can change a number.
+    # Packages whose versions can change results.
     packages = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
     return {
         "date": date.today().isoformat(),
@@ -282,13 +283,13 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
 
 def measure_matrix_speed() -> float:
-    """Measure the speed of a float32 matrix product in GFLOP/s, the best of some repeats.
+    """Measure the speed of a float32 matrix product in GFLOP/s, the best of five repeats.
 
     Run times of two machines are expected to be in the inverse ratio of these speeds.
     """
-    # Values do not matter for the speed.
+    # The speed does not depend on the values.
     a = np.ones((1024, 1024), dtype=np.float32)
-    # A product takes 2 n³ operations. Other work on the machine slows most of them, but rarely all.
+    # A product takes 2 n³ operations. Other work on the machine rarely slows all repeats.
     return 2.0 * len(a) ** 3 / min(timeit.repeat(lambda: a @ a, repeat=5, number=1)) / 1e9
 
 
@@ -302,7 +303,7 @@ def _busy_seconds(benchmarks: Path) -> float:
     benchmarks : Path
         Folder with a table of Snakemake for each job.
     """
-    # Start and end of each job: a benchmark is written when its job ends.
+    # Start and end of each job: its table is written when it ends.
     ends = ((path.stat().st_mtime, _last_run(path)["s"]) for path in benchmarks.rglob("*.tsv"))
     spans = sorted((end - np.nan_to_num(seconds), end) for end, seconds in ends)
     # Length of the union of all jobs' intervals, which are sorted by their start.
@@ -314,6 +315,6 @@ def _busy_seconds(benchmarks: Path) -> float:
 
 
 def _size_mb(folder: Path) -> float:
-    """Return the size of all files of a folder in MB, links left out."""
+    """Return the size of all files of a folder in MB, without symbolic links."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return sum(path.stat().st_size for path in files) / 1e6

@@ -1,4 +1,4 @@
-"""Fits of the methods: their files, options of commands that read them, and resources."""
+"""Fits of the methods: their files, resources, bundles, and the options of commands for them."""
 
 from __future__ import annotations
 
@@ -29,41 +29,41 @@ def method_names(run: Run, dataset: str) -> list[str]:
 
 
 def list_stored_methods(run: Run, dataset: str) -> list[type[Method]]:
-    """Return the methods of a dataset whose fit leaves files."""
+    """Return the methods of a dataset whose fit writes files."""
     return [m for m in map(method, method_names(run, dataset)) if m.storage]
 
 
 def fit_place(run: Run, name: str, dataset: str, split_name: str, reference: str) -> str:
-    """Return the folder or file of a fit."""
+    """Return the path of a fit, a folder or a file."""
     return f"{run.results}/{fit_files.get_fit_path(method(name), dataset, split_name, reference)}"
 
 
 def fit_outputs(run: Run, name: str, *key: str) -> list[str]:
     """Return all files of a fit of a dataset, split and reference; by default with wildcards."""
-    # With wildcards these are the outputs of a rule, with a key the inputs of a job.
-    place = fit_place(run, name, *(key or WILDCARDS))
-    return [str(path) for path in fit_files.outputs(method(name), place)]
+    # With wildcards, these are the outputs of a rule; with a key, the inputs of a job.
+    path = fit_place(run, name, *(key or WILDCARDS))
+    return [str(file) for file in fit_files.outputs(method(name), path)]
 
 
 def fit_option(run: Run, name: str, *key: str) -> str:
-    """Return the option of a command that takes the fit of a dataset, split and reference."""
+    """Return the option that gives a command the fit of a dataset, split and reference."""
     return f"--{name.replace('_', '-')}={fit_place(run, name, *key)}"
 
 
 def list_fit_files(run: Run, *key: str) -> list[str]:
-    """Return the files of all fits of a dataset that denoise stars of a split and reference."""
+    """Return the files of all fits of a dataset, split and reference."""
     return [p for m in list_stored_methods(run, key[0]) for p in fit_outputs(run, m.name, *key)]
 
 
 def fit_options(run: Run, *key: str) -> list[str]:
-    """Return the options of a command that takes these fits."""
+    """Return the options that give a command all fits of a dataset, split and reference."""
     return [fit_option(run, m.name, *key) for m in list_stored_methods(run, key[0])]
 
 
 def start_files(run: Run, name: str) -> Callable[[Wildcards], dict[str, list[str]]]:
-    """Return an input: the fit to the realisations from which the fit to the templates starts.
+    """Return an input function: the fit to realisations from which the fit to templates starts.
 
-    It is empty for fits to the realisations, and where the settings let fits start from scratch.
+    Its result is empty for fits to the realisations, and where fits start from scratch.
     """
 
     def start(wildcards: Wildcards) -> dict[str, list[str]]:
@@ -79,9 +79,10 @@ def start_files(run: Run, name: str) -> Callable[[Wildcards], dict[str, list[str
 
 
 def fit_log(name: str) -> str:
-    """Return the path of the log of a fit below the folder of logs, without ending."""
-    kind = method(name)
-    return f"{fit_files.get_rule_name(kind)}/{fit_files.stem(kind, *WILDCARDS)}"
+    """Return the path of the log of a fit, relative to the folder of logs, without suffix."""
+    fit_method = method(name)
+    stem = fit_files.stem(fit_method, *WILDCARDS)
+    return f"{fit_files.get_rule_name(fit_method)}/{stem}"
 
 
 def fit_params(run: Run, name: str) -> dict[str, Any]:
@@ -94,27 +95,27 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
     name : str
         Name of the method.
     """
-    # The checkpoint is named like the fit, so that fits at the same time do not share one.
+    # The checkpoint is named like the fit: fits that run at the same time do not share one.
     stem = fit_files.stem(method(name), *WILDCARDS)
 
-    # A function, so that settings are composed when the job is planned, not when rules are read.
+    # Functions: settings are composed when the job is planned, not when rules are read.
     def config(wildcards: Wildcards) -> str:
         return settings(run, "fit", f"dataset={wildcards.dataset}", name=name)
 
-    def more(wildcards: Wildcards, input: Any) -> list[str]:
+    def options(wildcards: Wildcards, input: Any) -> list[str]:
         reference = wildcards.get("reference")
-        options = [f"--reference={reference}"] if reference else []
+        words = [f"--reference={reference}"] if reference else []
         # `start_files` gives this input to fits to templates only.
         if input.get("start"):
             key = (wildcards.dataset, wildcards.split, "realisation")
-            options.append(f"--start={fit_place(run, name, *key)}")
-        return options
+            words.append(f"--start={fit_place(run, name, *key)}")
+        return words
 
     return {
         "config": config,
         "source": hash_code("fit", method(name).__module__),
         "method": name,
-        "more": more,
+        "more": options,
         "place": fit_place(run, name, *WILDCARDS),
         # Not an output: Snakemake would delete it with the outputs of a job that fails.
         "checkpoint": f"{run.results}/checkpoints/{name}/{stem}.pt",
@@ -123,7 +124,7 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
 
 def fit_resources(name: str) -> dict[str, int]:
     """Return memory in MB and time in minutes of a fit."""
-    # A scheduler of a cluster reserves these, and ends jobs that exceed them.
+    # The scheduler of a cluster reserves these, and kills jobs that exceed them.
     needs = method(name).needs
     return {"mem_mb": needs.memory_mb, "runtime": needs.minutes}
 
@@ -135,16 +136,16 @@ def fit_threads(run: Run, name: str) -> Callable[[Wildcards], int]:
 
 def most_threads(run: Run, dataset: str) -> int:
     """Return the largest number of threads of the fits of a dataset's methods."""
-    # One job fits all methods here, one after the other.
+    # For a job that fits all methods, one after the other.
     config = load_dataset_config(run, dataset)
     return max([m.threads(config) for m in list_stored_methods(run, dataset)], default=1)
 
 
 def list_new_rules(names: Iterable[str]) -> dict[str, str]:
-    """Return rule and name of the methods that store a fit and lack a rule among these.
+    """Return rules and names of the methods that store a fit and whose rule is not in `names`.
 
-    These are methods of other packages: the rules of our own are written out. In another project's
-    workflow, all names begin with the name of the module and an underscore.
+    These are methods of other packages: rules of our own methods are written out. In the workflow
+    of another project, all names begin with the name of its module and an underscore.
     """
     own_rules = remove_module_name(names, "baseline")
     methods_by_rule = {fit_files.get_rule_name(m): m.name for m in list_methods() if m.storage}
@@ -155,7 +156,7 @@ def list_new_rules(names: Iterable[str]) -> dict[str, str]:
 
 
 def bundle_suffixes() -> dict[str, str]:
-    """Return the names of the methods that can be packed, by the ending of their bundles."""
+    """Return the names of the methods that can be saved as bundles, by the suffix of these."""
     return {
         fit_files.get_bundle_suffix(m): m.name for m in list_methods() if m.storage and m.packing
     }
@@ -166,18 +167,18 @@ def bundle_file(run: Run, dataset: str, split_name: str, reference: str, suffix:
     return f"{run.results}/bundles/{dataset}-{split_name}-{reference}{suffix}{BUNDLE_SUFFIX}"
 
 
-def bundle_files(run: Run, dataset: str, networks: Iterable[tuple[str, str]]) -> list[str]:
+def bundle_files(run: Run, dataset: str, pairs: Iterable[tuple[str, str]]) -> list[str]:
     """Return the bundles of a dataset's methods for some pairs of split and reference."""
     return [
         bundle_file(run, dataset, split_name, reference, fit_files.get_bundle_suffix(m))
         for m in list_stored_methods(run, dataset)
         if m.packing
-        for split_name, reference in networks
+        for split_name, reference in pairs
     ]
 
 
 def bundle_memory(suffix: str) -> int:
-    """Return the memory in MB that packing takes: a fit's, and errors of many stars."""
+    """Return the memory in MB for a bundle: of its fit, at least 1500 for errors of many stars."""
     return max(1500, fit_resources(bundle_suffixes()[suffix])["mem_mb"])
 
 
@@ -187,19 +188,19 @@ def get_bundle_method(wildcards: Wildcards) -> str:
 
 
 def list_bundle_inputs(run: Run, wildcards: Wildcards) -> list[str]:
-    """Return the files of the fit that a bundle packs."""
+    """Return the files of the fit from which a bundle is written."""
     key = (wildcards.dataset, wildcards.split, wildcards.reference)
     return fit_outputs(run, get_bundle_method(wildcards), *key)
 
 
 def get_bundle_option(run: Run, wildcards: Wildcards) -> str:
-    """Return the option of a command that takes this fit."""
+    """Return the option that gives a command this fit."""
     key = (wildcards.dataset, wildcards.split, wildcards.reference)
     return fit_option(run, get_bundle_method(wildcards), *key)
 
 
 def seed_fits(run: Run, wildcards: Wildcards) -> list[str]:
-    """Return the fits of a method with the default seed; empty if the method stores no fit."""
+    """Return the files of a method's fits with the default seed; empty if it stores no fit."""
     if method(wildcards.method).storage is None:
         return []
     # Other seeds are compared with the default seed on the random split only.
@@ -211,29 +212,29 @@ def seed_fits(run: Run, wildcards: Wildcards) -> list[str]:
     ]
 
 
-# Code and courses of trainings.
+# Code of commands, and histories of trainings.
 
 
 def estimators_code(run: Run, command: str, dataset: str) -> str:
-    """Return the hash of a command that applies the methods of a dataset."""
+    """Return the hash of the code of a command that applies the methods of a dataset."""
     return methods_code(command, method_names(run, dataset))
 
 
 def methods_code(command: str, names: Iterable[str]) -> str:
-    """Return the hash of a command that applies some methods."""
+    """Return the hash of the code of a command that applies some methods."""
     return source_hash(command, *(method(name).__module__ for name in names))
 
 
 def histories(run: Run, dataset: str) -> dict[str, str]:
-    """Return the tables with the courses of a dataset's trainings, each with its label."""
-    # Not every method leaves a table with the course of its training.
+    """Return the tables with the histories of a dataset's trainings, each with its label."""
+    # Not every method writes a table with the history of its training.
     group = load_dataset_config(run, dataset).dataset
     methods = list_stored_methods(run, dataset)
     trainings = [m for m in methods if HISTORY in fit_files.get_storage(m).diagnostics]
     labels = {}
     for m, *key in product(trainings, group.splits, group.references):
-        place = fit_place(run, m.name, dataset, *key)
-        # The method's label distinguishes courses of several methods.
+        path = fit_place(run, m.name, dataset, *key)
+        # The method's label distinguishes histories of several methods.
         words = [dataset, *key, *([m.look.label] if len(trainings) > 1 else [])]
-        labels[str(fit_files.path_beside(m, place, HISTORY))] = ", ".join(words)
+        labels[str(fit_files.path_beside(m, path, HISTORY))] = ", ".join(words)
     return labels

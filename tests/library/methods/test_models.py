@@ -282,10 +282,14 @@ def killed(model):
     return model
 
 
-def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch):
+def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dae_network, "build_dae", lambda *arguments: killed(build_dae(*arguments)))
     with pytest.raises(TrainingError, match="died in all 2 attempts"):
         train(data, tmp_path)
+    # Only the first is followed by another one.
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("attempt 1 of 2: ") and first.endswith("starting from another seed")
+    assert last.startswith("attempt 2 of 2: ") and "another seed" not in last
 
 
 def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):

@@ -408,7 +408,7 @@ class DaeTraining(Training):
             stars = np.arange(len(data.images))
             self.constant_draw = data.draw(stars, stream(seed, "dae", "fixed noise"))
 
-    def begin(self, lr: float) -> torch.optim.Optimizer:
+    def make_optimiser(self, lr: float) -> torch.optim.Optimizer:
         """Return the optimiser: Muon for the weights of the inner layers, Adam for the others.
 
         With the setting "adam", Adam is used for all weights. Muon is meant for the matrices

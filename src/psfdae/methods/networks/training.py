@@ -1,7 +1,7 @@
 """The training loop of all networks, which can be interrupted and keeps the best state.
 
 Each epoch draws its order, noise levels and noise from its own random stream, so that a training
-that resumes after epoch e continues with exactly the numbers of an uninterrupted one.
+that resumes after epoch e gives exactly the result of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class TrainingError(FitError):
 
 
 class DeadNetworkError(Error, RuntimeError):
-    """Zero output for all or most stars; the gradient of such a network is 0, too."""
+    """Zero output for all or most stars; such a network also has a gradient of 0."""
 
 
 class Adam(torch.optim.Adam):
@@ -51,9 +51,9 @@ class Adam(torch.optim.Adam):
 
 
 class Muon(Adam):
-    """Adam in which matrices of groups marked `orthogonal` take steps of orthogonal directions.
+    """Adam, but the matrices of groups marked `orthogonal` take orthogonalised steps.
 
-    The momentum of a matrix (out, in) is replaced by the nearest semi-orthogonal matrix, by
+    The step of a matrix (out, in) is about the semi-orthogonal matrix nearest to its momentum, from
     five steps of a Newton–Schulz iteration (K. Jordan et al. 2024, "Muon"), scaled so that
     its elements have the RMS of Adam's steps (Liu et al. 2025, arXiv:2502.16982).
     """
@@ -68,14 +68,14 @@ class Muon(Adam):
             steps = []
             for weight in weights:
                 state = self.state[weight]
-                if not state:  # Adam wants a step in every state that it restores
+                if not state:  # Adam's load_state_dict requires a step in every state
                     state |= {"step": torch.tensor(0.0), "momentum": torch.zeros_like(weight)}
                 # Nesterov's momentum: m ← β m + (1 − β) g, and the step is along β m + (1 − β) g.
                 momentum = state["momentum"]
                 momentum.lerp_(weight.grad, 1 - beta)
                 steps.append(weight.grad.lerp(momentum, beta).flatten(1))
             # A semi-orthogonal (m, n) matrix has elements of RMS 1/√max(m, n); Adam's steps have
-            # about 0.2. Without a gradient, Adam then leaves the matrix as it is.
+            # about 0.2. Without a gradient, Adam then leaves the matrix unchanged.
             for weight, step in zip(weights, orthogonal(steps), strict=True):
                 scale = 0.2 * max(step.shape) ** 0.5
                 weight.add_(step.view_as(weight), alpha=-group["lr"] * scale)
@@ -100,10 +100,11 @@ def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """
     if not matrices:
         return []
-    # The iteration converges for singular values up to 1. Tall matrices are transposed.
+    # The iteration needs singular values of at most 1, which division by the norm ensures. Tall
+    # matrices are transposed.
     unit_matrices = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
     # A Newton–Schulz step is X ← f(G) X with f(G) = a + b G + c G² and the Gram matrix G = X Xᵀ,
-    # so that G ← f G f. Only the small Gram matrices are iterated, all together and padded to the
+    # so that G ← f G f. Only the small Gram matrices are iterated, in one stack and padded to the
     # same size; then each matrix is multiplied once by the product of all f.
     side = max(len(m) for m in unit_matrices)
     gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in unit_matrices])
@@ -122,7 +123,7 @@ class Course(Protocol):
 
     @property
     def lr(self) -> float:
-        """Learning rate, or its maximum for one-cycle."""
+        """Learning rate; for one-cycle its maximum."""
 
     @property
     def schedule(self) -> str:
@@ -138,14 +139,14 @@ class Course(Protocol):
 
     @property
     def checkpoint_seconds(self) -> float:
-        """Minimum time between checkpoints."""
+        """Minimum time between checkpoints in seconds."""
 
 
 def use_half_precision(is_enabled: bool = True) -> torch.autocast:
     """Return a context in which convolutions and products of matrices use bfloat16 numbers.
 
     These have the range of float32 and 8 significant bits; weights and sums remain float32.
-    Processors with instructions for them (AVX-512 BF16) need less time; for others, or if it is not
+    Processors with instructions for them (AVX-512 BF16) are faster then; on others, or if not
     enabled, the context has no effect.
     """
     # Older versions of torch have no function for the capabilities of the processor.
@@ -170,26 +171,27 @@ class Training(ABC):
     key : str
         Config group of the settings, for messages.
     rate : callable
-        Learning rate of an epoch, counted from 0, over `settings.lr`; not used for one-cycle.
+        Function of the epoch, counted from 0, that returns the learning rate over `settings.lr`;
+        not used for one-cycle.
 
     Attributes
     ----------
     history : list of Row
         A row for each completed epoch.
     seconds, cpu_seconds : float
-        Elapsed time of these epochs, and time of the processor.
+        Elapsed time and CPU time of these epochs.
     best_mse : float
         Smallest validation error; infinite before the first validation.
     best_state : dict of str to torch.Tensor
-        Weights of the network with this error.
+        Weights of the network at this error; empty before the first validation.
     """
 
     grad_clip = float("inf")
     half_precision_start = 0.5
     """Fraction of the epochs after which half precision is used.
 
-    In all epochs it increases errors of the DAE by up to 2 %, but not in the second half of the
-    epochs alone (studies/training).
+    If used in all epochs, it increases errors of the DAE by up to 2 %; if used in the second half
+    only, it does not (studies/training).
     """
     state_dicts = ("model", "optimiser", "scheduler")
     """Attributes whose `state_dict` a checkpoint contains."""
@@ -209,11 +211,11 @@ class Training(ABC):
     ) -> None:
         self.model, self.settings, self.steps = model, settings, steps
         self.attempt, self.key = attempt, key
-        self.optimiser = self.begin(settings.lr)
+        self.optimiser = self.make_optimiser(settings.lr)
         # One-cycle: the rate rises to its maximum and falls to nearly 0, step by step.
         self.scheduler: LRScheduler
         if settings.schedule == "onecycle":
-            total = max(settings.epochs * steps, 2)  # torch divides by the number less 1
+            total = max(settings.epochs * steps, 2)  # torch divides by this number minus 1
             self.scheduler = OneCycleLR(
                 self.optimiser, settings.lr, total_steps=total, anneal_strategy="linear"
             )
@@ -224,7 +226,7 @@ class Training(ABC):
         self.best_mse = float("inf")
         self.best_state: dict[str, torch.Tensor] = {}
 
-    def begin(self, lr: float) -> torch.optim.Optimizer:
+    def make_optimiser(self, lr: float) -> torch.optim.Optimizer:
         """Return the optimiser, Adam unless a subclass chooses another one."""
         return Adam(self.model.parameters(), lr=lr, fused=True)
 
@@ -249,7 +251,7 @@ class Training(ABC):
         """
 
     def validate(self, epoch: int) -> float:
-        """Return the validation error, which selects the best state; NaN without a validation."""
+        """Return the validation error, which selects the best state; NaN if the epoch has none."""
         return float("nan")
 
     def is_finished(self) -> bool:
@@ -263,7 +265,7 @@ class Training(ABC):
 
     @property
     def result(self) -> dict[str, torch.Tensor]:
-        """Weights with the smallest validation error; without any validation the last ones."""
+        """Weights with the smallest validation error; the last weights without any validation."""
         return self.best_state or self.model.state_dict()
 
     def run_epoch(self) -> Row:
@@ -276,7 +278,7 @@ class Training(ABC):
         DeadNetworkError
             If the outputs of the network are zero.
         """
-        # Times of epochs are summed over interruptions, so that they are part of the state.
+        # Times are sums over epochs, and part of the state: they continue after an interruption.
         start_time, start_cpu_time = time.monotonic(), time.process_time()
         epoch, rate = len(self.history), self.rate
         losses: list[float] = []
@@ -298,22 +300,22 @@ class Training(ABC):
         return self.history[-1]
 
     def take_step(self, batch: tuple[torch.Tensor, ...], step: int) -> float:
-        """Make a step of the optimiser with a batch, and return the loss before it."""
+        """Make a step of the optimiser with a batch, and return the loss before the step."""
         is_late = len(self.history) >= self.half_precision_start * self.settings.epochs
         with use_half_precision(is_late):
             loss = self.loss(batch, step)
-        value = self._finite("loss", loss, step)
+        value = self._check_finite("loss", loss, step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         # Clipping returns the norm before clipping.
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
-        self._finite("gradient's norm", norm, step)
+        self._check_finite("gradient's norm", norm, step)
         # The learning rate changes after every step, not after every epoch.
         self.optimiser.step()
         self.scheduler.step()
         return value
 
-    def _finite(self, quantity: str, tensor: torch.Tensor, step: int) -> float:
+    def _check_finite(self, quantity: str, tensor: torch.Tensor, step: int) -> float:
         """Return the value of a tensor of one element; raise TrainingError if it is not finite."""
         value = tensor.item()
         if not np.isfinite(value):
@@ -325,7 +327,7 @@ class Training(ABC):
 
     def state(self) -> dict[str, Any]:
         """Return the state for `restore`, as tensors and plain values."""
-        # The learning rate is part of the scheduler's state, moments of the optimiser's state.
+        # The scheduler's state includes the learning rate, the optimiser's state the moments.
         state = {name: getattr(self, name).state_dict() for name in self.state_dicts}
         return state | {name: getattr(self, name) for name in self.plain_fields}
 
@@ -349,11 +351,11 @@ def train(
     Parameters
     ----------
     begin : callable
-        Function that makes the training of an attempt from its number.
+        Function that returns the training of an attempt, given its number from 0.
     checkpoint : Path
-        File of the state; the caller removes it when the result is written.
+        File of the state; the caller removes it after writing the result.
     fingerprint : str
-        Hash of configuration and data; a checkpoint with another one is ignored.
+        Hash of configuration and data; a checkpoint with another hash is ignored.
     report : callable
         Function that is called with the row of the history after each epoch.
     restarts : int
@@ -367,7 +369,7 @@ def train(
     Raises
     ------
     TrainingError
-        If loss, gradient or error is not finite, or if the network died in all attempts.
+        If loss, gradient or validation error is not finite, or if the network died in all attempts.
     """
     # An interrupted training continues in the same attempt.
     saved_state, log_epoch = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
@@ -383,14 +385,15 @@ def train(
                 row = training.run_epoch()
                 report(row)
                 log_epoch(row)
-                # Writing takes time: only every few seconds, and after complete epochs.
+                # Writing takes time: at most one checkpoint per interval, after a complete epoch.
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
             return training
         except DeadNetworkError as death:
-            # Another network may live with other initial weights and other noise.
-            print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
+            # A network with other initial weights and other noise may not die.
+            remedy = "; starting from another seed" if attempt < restarts else ""
+            print(f"attempt {attempt + 1} of {restarts + 1}: {death}{remedy}", flush=True)
     raise TrainingError(
         f"the network died in all {restarts + 1} attempts: "
         f"lower {training.key}.lr = {training.settings.lr}"
@@ -398,7 +401,7 @@ def train(
 
 
 def listener(checkpoint: Path) -> Callable[[Row], None]:
-    """Return a function that logs each epoch elsewhere, such as in MLflow, or has no effect.
+    """Return a function that logs each epoch, such as to MLflow; by default it has no effect.
 
     The environment variable PSFDAE_EPOCHS names a function as "module:function". This function
     takes the path of the checkpoint and returns a function of the row of each epoch.
@@ -406,15 +409,15 @@ def listener(checkpoint: Path) -> Callable[[Row], None]:
     module, _, function = os.environ.get("PSFDAE_EPOCHS", "").partition(":")
     if not function:
         return lambda row: None
-    # By name, because a log does not change results: a change of its code must not repeat
-    # trainings.
+    # Imported by name: a log does not change results, and so its code must not be part of the hash
+    # by which the workflow repeats trainings.
     log_epoch: Callable[[Row], None] = getattr(import_module(module), function)(checkpoint)
     return log_epoch
 
 
 def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
     """Return the SHA-256 of the data and settings that determine the result of a training."""
-    # Settings by their JSON with sorted keys, arrays by their bytes.
+    # Settings as JSON with sorted keys, arrays as bytes.
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -423,11 +426,11 @@ def fingerprint(settings: Mapping[str, Any], *arrays: np.ndarray) -> str:
 
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
-    """Yield the function that a training calls with the errors of each epoch."""
+    """Show a progress bar; yield the function that a training calls with the row of each epoch."""
     headings = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
 
     def report(row: Row) -> None:
-        # Not every epoch is validated, and networks have different losses.
+        # Not every epoch has a validation, and networks have different losses.
         errors = [
             f"{heading} {row[key]:.3e}"
             for key, heading in headings.items()
