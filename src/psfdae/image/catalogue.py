@@ -1,8 +1,8 @@
 """Star catalogues: positions, identifiers, fluxes and flags of the stars of a list.
 
 Inputs: a file (`list_formats`), a table of astropy or pandas, sky coordinates or positions. Output:
-`Catalogue`, of which each method returns one value for each star. The case of column names does not
-matter; `position_columns` chooses the columns of positions.
+`Catalogue`, whose methods return one value for each star. The case of column names is ignored;
+`position_columns` chooses the columns of positions.
 """
 
 from __future__ import annotations
@@ -41,17 +41,20 @@ StarList: TypeAlias = (
     | Table
     | DataFrame
 )
-"""Star list as the public calls take it; see `as_catalogue`."""
+"""Star list that public functions accept; see `as_catalogue`."""
+
+_MISSING = ("None", "nan", "<NA>", "NaT")
+"""Missing values of Python, numpy and pandas, as text."""
 
 
 @dataclass(frozen=True)
 class Catalogue:
-    """A table of stars; rows keep their order, and all are kept.
+    """A table of stars, with all rows of the list in their order.
 
     Attributes
     ----------
     path : Path
-        File of the list, or the name of a list in memory in messages.
+        File of the list; for a list in memory, its name in messages.
     table : Table
         All columns, as astropy reads them.
     """
@@ -68,9 +71,10 @@ class Catalogue:
         Parameters
         ----------
         name : str
-            Name of the column; case is ignored unless a column is written exactly so.
+            Name of the column; case is ignored unless a column has exactly this name.
         strict : bool
-            Reject a text that is not a number; else it is NaN, unless it has a decimal comma.
+            If True, a text that is not a number is an error; if False, it is NaN, but a text with a
+            comma remains an error.
 
         Raises
         ------
@@ -81,12 +85,12 @@ class Catalogue:
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
-        # Numbers; masked ones are missing.
+        # Numbers; masked ones become NaN.
         if column.dtype.kind in "iuf":
             return np.ma.filled(np.ma.array(column).astype(np.float64), np.nan)
         if column.dtype.kind not in "SUO":
             raise ObservationError(self.path, f"column {name!r} does not hold numbers")
-        # Numbers written as text, as when one row has a word.
+        # Numbers as text, such as when one row has a word.
         numbers = np.full(len(column), np.nan)
         for row, text in enumerate(_texts(column)):
             try:
@@ -101,7 +105,7 @@ class Catalogue:
         return numbers
 
     def coordinates(self, name: str) -> np.ndarray:
-        """Return a column of finite numbers, (n,), NaN elsewhere; an error if all are NaN.
+        """Return a column of finite numbers, (n,), NaN where there is none.
 
         Raises
         ------
@@ -109,20 +113,20 @@ class Catalogue:
             If the column does not exist, or does not contain a finite number.
         """
         numbers = self.numbers(name, strict=False)
-        # Infinite numbers are missing values.
+        # Infinite numbers are taken as missing.
         finite = np.isfinite(numbers)
         if not finite.any():
             raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
         return np.where(finite, numbers, np.nan)
 
     def pixels(self, name: str) -> np.ndarray:
-        """Return a column of pixel positions, as `coordinates`; rejects other units than pixels."""
+        """Return a column of pixel positions, as `coordinates`; other units raise an error."""
         from astropy import units
 
         # A column without a unit is in pixels.
         unit = getattr(self._column(name), "unit", None)
         pixel_unit = units.Unit(unit or "", parse_strict="silent")
-        # A unit that astropy does not know may be a word for pixels.
+        # A unit that astropy does not know may be another word for pixels.
         is_unit = not isinstance(pixel_unit, units.UnrecognizedUnit)
         if is_unit and pixel_unit not in (units.pix, units.dimensionless_unscaled):
             raise ObservationError(
@@ -131,7 +135,7 @@ class Catalogue:
         return self.coordinates(name)
 
     def positions(self) -> Positions:
-        """Return the columns with the positions; an error lists the names that are accepted."""
+        """Return the columns of the positions; the error if none fit lists the accepted names."""
         try:
             return choose_positions(self.table.colnames)
         except ColumnError as error:
@@ -143,26 +147,31 @@ class Catalogue:
     def sky(self, positions: Positions) -> tuple[np.ndarray, np.ndarray]:
         """Return right ascension and declination in degrees, each of shape (n,).
 
-        Columns without unit are in degrees; text with colons, blanks or letters is
-        sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
-        off the sphere are NaN, and an error is raised if all are. LSST's `coord_ra` and `coord_dec`
-        without a unit are in radians if all may be.
+        Columns without unit are in degrees. Text with colons, blanks, h or d is sexagesimal; right
+        ascensions are then in hours unless one is above 24. Declinations outside ±90° are NaN.
+        LSST's `coord_ra` and `coord_dec` without a unit are in radians if all right ascensions are
+        below 2π.
+
+        Raises
+        ------
+        ObservationError
+            If no declination is within ±90°, or if a column is missing or does not hold angles.
         """
         ra = self._angles(positions.first, "hourangle")
         dec = self._angles(positions.second, "deg")
-        # Lists of LSST that are in degrees have larger numbers nearly everywhere on the sky.
+        # Nearly everywhere on the sky, right ascensions in degrees are above 2π.
         has_unit = getattr(self._column(positions.first), "unit", None) is not None
         if positions.first.lower() == "coord_ra" and not has_unit and np.nanmax(ra) < 2 * np.pi:
             ra, dec = np.rad2deg(ra), np.rad2deg(dec)
         # Declinations beyond a pole are not positions on the sky.
-        on_sphere = np.abs(dec) <= 90
-        if not on_sphere.any():
+        is_on_sky = np.abs(dec) <= 90
+        if not is_on_sky.any():
             row = np.flatnonzero(np.isfinite(dec))[0]
             raise ObservationError(
                 self.path,
                 f"column {positions.second!r} is {dec[row]:g}° in row {row + 1}, expected -90 … 90",
             )
-        return ra, np.where(on_sphere, dec, np.nan)
+        return ra, np.where(is_on_sky, dec, np.nan)
 
     def _angles(self, name: str, sexagesimal_unit: str) -> np.ndarray:
         """Return a column of angles in degrees, shape (n,), NaN where a value is missing.
@@ -172,7 +181,7 @@ class Catalogue:
         name : str
             Column of numbers or texts.
         sexagesimal_unit : str
-            Unit of texts such as 10:00:12, "hourangle" or "deg".
+            Unit of text such as 10:00:12: "hourangle" or "deg".
         """
         from astropy import units
         from astropy.coordinates import Angle
@@ -205,7 +214,7 @@ class Catalogue:
             ) from None
 
     def flags(self, positions: Positions) -> np.ndarray:
-        """Return the flags of the program that made the list, as `StarFlag`s.
+        """Return the flags of the program that wrote the list, as `StarFlag`s.
 
         Parameters
         ----------
@@ -220,29 +229,30 @@ class Catalogue:
         flags = np.zeros(len(self), dtype=np.uint16)
         if positions.flags is not None and positions.flags in self.table.colnames:
             values = np.nan_to_num(self.numbers(positions.flags), posinf=0, neginf=0)
-            # SExtractor's bits against a star; its bit 1, a neighbour nearby, is not a fault.
+            # SExtractor's bits that matter for a PSF; bit 1, a bright neighbour nearby, is ignored.
             bits = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
             for bit, flag in bits.items():
                 raise_flag(flags, flag, (values.astype(np.int64) & bit) > 0)
         return flags
 
     def identifiers(self) -> np.ndarray:
-        """Return one identifier per star, int64 or str, shape (n,); row numbers from 0 without.
+        """Return one identifier per star, int64 or str, shape (n,).
 
-        The first column that the list has of id, source_id, number and the like identifies them.
+        It is the first column of the list among id, source_id, number and similar names
+        (`find_identifier`); without any, the number of the row from 0.
         """
-        # Without a column, the number of the row.
+        # Without such a column, the number of the row.
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
-        # Whole numbers stay numbers, also if a column of real numbers has them; all else is text.
-        # Readers of text keep texts that numbers would change, such as 001 or 1e5.
+        # Whole numbers stay numbers, also those in a column of floats; all else becomes text. The
+        # readers of text files leave identifiers such as 001 or 1e5 as text.
         column = self._column(name)
         values = np.ma.getdata(column)
         if values.dtype.kind in "iuf" and not np.ma.getmaskarray(column).any():
             with np.errstate(all="ignore"):
                 integers = values.astype(np.int64)
-            # Unsigned numbers beyond the largest signed one come back negative.
+            # Unsigned numbers above the largest signed number become negative.
             is_same = (integers.astype(values.dtype) == values) & ((integers < 0) == (values < 0))
             if is_same.all():
                 return integers
@@ -255,10 +265,10 @@ class Catalogue:
         return find_identifier([name for name in columns if is_plain[name]])
 
     def columns(self, rows: np.ndarray) -> Table:
-        """Return some rows of all columns of numbers and text but identifiers and pixel positions.
+        """Return rows of the columns of numbers and text, without identifiers and pixel positions.
 
-        Columns of arrays, such as images of the stars, are left out, and so are all columns after
-        the first 900, as a FITS table has 999 at most.
+        Columns of arrays, such as images of the stars, are left out, and all columns after the
+        first 900, as a FITS table has at most 999.
 
         Parameters
         ----------
@@ -267,15 +277,18 @@ class Catalogue:
         """
         from astropy.table import Table
 
-        # Positions on the sky stay; positions in pixels are written anew.
+        # Positions on the sky stay; the result has identifiers and pixel positions of its own.
         further_columns, positions = Table(), self.positions()
-        read = {self._identifier(), *(() if positions.sky else (positions.first, positions.second))}
+        left_out = {
+            self._identifier(),
+            *(() if positions.sky else (positions.first, positions.second)),
+        }
         for name in self.table.colnames[:900]:
             column = self.table[name]
             # Times, coordinates and arrays do not belong in a table of numbers.
-            if name in read or not isinstance(column, np.ndarray) or column.ndim != 1:
+            if name in left_out or not isinstance(column, np.ndarray) or column.ndim != 1:
                 continue
-            # Texts of pandas are objects; so are the arrays of variable length of FITS tables.
+            # Texts of pandas are objects, and so are the variable-length arrays of FITS tables.
             if column.dtype.kind == "O" and not isinstance(column[0], np.ndarray):
                 column = column.astype(str)
             if column.dtype.kind in "biufUS":
@@ -285,7 +298,7 @@ class Catalogue:
     def _column(self, name: str) -> Column:
         """Return a column; ObservationError if it does not exist, or is not an array.
 
-        The case of the name is ignored if no column is written exactly so.
+        The case of the name is ignored unless a column has exactly this name.
         """
         names = self.table.colnames
         try:
@@ -303,29 +316,33 @@ class Catalogue:
 
 
 def _texts(column: Column) -> list[str]:
-    """Return the values of a column as text without blanks around it, "" where one is missing.
+    """Return the values of a column as text without blanks around it.
 
-    Bytes are decoded as UTF-8; masked values are "".
+    Bytes are decoded as UTF-8. Masked values, and None, NaN or NA of pandas, are "".
     """
     # FITS has text as bytes.
     values = np.where(np.ma.getmaskarray(column), "", np.ma.getdata(column).astype(object))
-    texts = (v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values)
-    return [text.strip() for text in texts]
+    texts = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values]
+    # Columns of Python objects mark a missing value by an object that is not a text.
+    is_missing = [not isinstance(v, str | bytes) and str(v) in _MISSING for v in values]
+    return [
+        "" if missing else text.strip() for text, missing in zip(texts, is_missing, strict=True)
+    ]
 
 
 def read_catalogue(path: Path) -> Catalogue:
-    """Read a star catalogue from a file of one of the formats of `list_formats`.
+    """Read a star catalogue from a file in one of the formats of `list_formats`.
 
     Raises
     ------
     ObservationError
         If the file cannot be read, or does not contain stars.
     """
-    return _catalogue(path, read_list_table(path))
+    return _make_catalogue(path, read_list_table(path))
 
 
 def as_catalogue(star_list: StarList) -> Catalogue:
-    """Return a star list from a file, a table, or positions.
+    """Convert a star list, a file, table or positions, to a `Catalogue`.
 
     Parameters
     ----------
@@ -340,7 +357,7 @@ def as_catalogue(star_list: StarList) -> Catalogue:
         return star_list
     if isinstance(star_list, str | Path):
         return read_catalogue(Path(star_list))
-    # Anything but a table becomes columns of a table.
+    # Positions become columns of a table.
     path = Path("catalogue")
     with reading(path):
         # A table of sky coordinates; an array or a sequence of pairs; else a table.
@@ -350,33 +367,32 @@ def as_catalogue(star_list: StarList) -> Catalogue:
         if isinstance(star_list, SkyCoord):
             star_list = {"sky": star_list.reshape(-1)}
         elif is_pairs:
-            star_list = _pairs(path, star_list)
-        # pandas does not have units; astropy reads its records.
-        records = getattr(star_list, "to_records", None)  # of a DataFrame
-        # Quantities become columns with units.
-        table = Table(star_list if records is None else records(index=False))
-    return _catalogue(path, table)
+            star_list = _split_pairs(path, star_list)
+        # A DataFrame becomes a structured array. Quantities become columns with units.
+        to_records = getattr(star_list, "to_records", None)
+        table = Table(star_list if to_records is None else to_records(index=False))
+    return _make_catalogue(path, table)
 
 
-def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
-    """Return the columns of positions (n, 2), x and y, NaN where they are masked.
+def _split_pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
+    """Return the columns x and y of positions (n, 2), NaN where they are masked.
 
-    The columns have the names that photutils gives, `x_fit` and `y_fit`, which count from 0.
+    They have the column names of photutils, `x_fit` and `y_fit`, which are 0-based.
 
     Raises
     ------
     ObservationError
         If the positions have another unit than pixels, or are not numbers of shape (n, 2).
     """
-    # Positions with another unit than pixels are on the sky, and come without a WCS.
+    # Only pixels: an array of angles does not have a frame, such as the ICRS.
     values, mask, unit = split_array(star_list)
     if unit not in ("", "pix", "pixel"):
         raise ObservationError(
-            path, f"positions in {unit}, expected pixels; sky coordinates go as a SkyCoord"
+            path, f"positions in {unit}, expected pixels; pass sky coordinates as a SkyCoord"
         )
     if values.ndim != 2 or values.shape[1] != 2 or values.dtype.kind not in "fiu":
         raise ObservationError(
-            path, f"positions of shape {values.shape}, expected numbers of (n, 2)"
+            path, f"positions of shape {values.shape}, expected numbers of shape (n, 2)"
         )
     values = values.astype(np.float64)
     if mask is not None:
@@ -384,8 +400,8 @@ def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
     return {"x_fit": values[:, 0], "y_fit": values[:, 1]}
 
 
-def _catalogue(path: Path, table: Table) -> Catalogue:
-    """Return a catalogue of a table with stars; an only column of SkyCoord becomes RA and Dec.
+def _make_catalogue(path: Path, table: Table) -> Catalogue:
+    """Return a catalogue with a table of stars; a single column of SkyCoord becomes ra and dec.
 
     Raises
     ------
@@ -396,16 +412,16 @@ def _catalogue(path: Path, table: Table) -> Catalogue:
 
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
-    # A table may have SkyCoord in place of two columns of numbers.
-    sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
-    if len(sky) == 1:
+    # A table may have a column of SkyCoord in place of two columns of numbers.
+    sky_names = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    if len(sky_names) == 1:
         # In degrees of the ICRS, NaN where a coordinate is masked.
         with reading(path):
-            icrs, table = table[sky[0]].icrs, table.copy(copy_data=False)
+            icrs, table = table[sky_names[0]].icrs, table.copy(copy_data=False)
             for name, angle in (("ra", icrs.ra), ("dec", icrs.dec)):
                 values, mask, _ = split_array(angle.deg)
                 table[name] = np.where(mask if mask is not None else False, np.nan, values)
-            table.remove_column(sky[0])
+            table.remove_column(sky_names[0])
     return Catalogue(path, table)
 
 
@@ -418,11 +434,16 @@ def require_sky(stars: StarList, purpose: str) -> None:
         The list (`as_catalogue`).
     purpose : str
         Task that needs sky coordinates, for the message.
+
+    Raises
+    ------
+    ObservationError
+        If the list does not have sky coordinates.
     """
     table = as_catalogue(stars)
     if not table.positions().sky:
         raise ObservationError(
             table.path,
-            f"{purpose} takes a list with sky coordinates, or {keyword('detect', True)}: pixels "
-            "do not say which image they are of",
+            f"{purpose} takes a list with sky coordinates, or {keyword('detect', True)}: pixel "
+            "positions do not identify their image",
         )

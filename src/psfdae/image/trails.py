@@ -1,4 +1,4 @@
-"""Trails of satellites and aeroplanes, and spikes of saturated stars: straight and narrow light.
+"""Trails of satellites and aeroplanes, and spikes of saturated stars: straight, narrow features.
 
 Inputs: an image and its bad pixels. Output: bad pixels, with trails and spikes added.
 """
@@ -24,81 +24,93 @@ class Line(NamedTuple):
     distance_px: float
 
     def across(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the signed distance of positions from the line, px."""
+        """Return the signed distances of positions from the line, in px."""
         across = x * np.sin(self.angle_rad) - y * np.cos(self.angle_rad)
         return np.asarray(across - self.distance_px)
 
     def along(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the position along the line, px."""
+        """Return the coordinates of positions along the line, in px."""
         return np.asarray(x * np.cos(self.angle_rad) + y * np.sin(self.angle_rad))
 
 
 def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> BadPixels:
     """Add the pixels of trails and spikes to the bad pixels of an image (h, w).
 
-    Without a trail or spike, they are returned with the sky of the image, which was measured for
-    the search, unless the image is so large that its means over squares were searched: lengths in
-    pixels of the search are then sides of these squares. They are returned unchanged if no sky can
-    be measured, or if the image is smaller than a trail.
+    Of an image whose shorter side has 2000 px or more, means over squares of pixels are searched;
+    all lengths in pixels are then in sides of these squares.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
-        Finite pixels, in the unit of `saturate`.
+        Image of finite values, in the unit of `saturate`.
     bad_pixels : BadPixels
         Bad pixels of other kinds, which are left out of the search.
     saturate : float
-        Value from which a pixel is saturated; infinite if unknown: no spikes are searched then.
+        Value from which a pixel is saturated. If it is unknown, it is infinite, and no spikes are
+        found.
+
+    Returns
+    -------
+    BadPixels
+        With the pixels of trails and spikes, and a note on each kind. If there are none, with the
+        sky of the image, which was measured for the search, unless squares were searched. Unchanged
+        if no sky can be measured, or if a side of the image is below 100 px.
     """
     from astropy.nddata import block_reduce, block_replicate
 
     if min(image.shape) < 100:
         return bad_pixels
-    # Of large images, means of the good pixels in squares are enough: a side has 1000 to 2000.
-    size = max(min(image.shape) // 1000, 1)
-    values, hidden = image, bad_pixels.mask
-    if size > 1:
-        values = block_reduce(np.where(hidden, np.nan, image), size, np.nanmean)
-        hidden = np.isnan(values)
-    # Saturated cores stay unchanged, so that these stars are flagged as saturated.
-    is_saturated = (values >= saturate) & ~hidden
+    # Of large images, means of the good pixels in squares are enough, 1000 to 2000 of them along
+    # the shorter side.
+    square_px = max(min(image.shape) // 1000, 1)
+    values, bad = image, bad_pixels.mask
+    if square_px > 1:
+        values = block_reduce(np.where(bad, 0.0, image), square_px, np.sum)
+        count = block_reduce(~bad, square_px, np.sum).astype(values.dtype)
+        values, bad = values / np.maximum(count, 1), count == 0
+    # Saturated cores do not become bad pixels, so that these stars are flagged as saturated.
+    is_saturated = (values >= saturate) & ~bad
     is_core = scipy.ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
-    values = np.where(hidden, 0.0, values)
+    values = np.where(bad, 0.0, values)
     try:
-        sky = sky_level(values, hidden)
+        sky = sky_level(values, bad)
     except ValueError:  # no mesh has enough good pixels
         return bad_pixels
-    spikes = find_spikes(values, hidden, sky, is_saturated) & ~is_core
-    trails, number = find_trails(values, hidden | spikes | is_core, sky)
-    if not (number or spikes.any()):
-        return bad_pixels if size > 1 else replace(bad_pixels, sky=sky)
+    spikes = find_spikes(values, bad, sky, is_saturated) & ~is_core
+    trails, trail_count = find_trails(values, bad | spikes | is_core, sky)
+    if not (trail_count or spikes.any()):
+        return bad_pixels if square_px > 1 else replace(bad_pixels, sky=sky)
     mask, notes = bad_pixels.mask.copy(), list(bad_pixels.notes)
-    words = "a trail" if number == 1 else f"{number} trails"
-    for squares, kind in (spikes, "spikes of saturated stars"), (trails, f"{words} of satellites"):
+    trail_text = "a satellite trail" if trail_count == 1 else f"{trail_count} satellite trails"
+    for squares, kind in (spikes, "spikes of saturated stars"), (trails, trail_text):
         # From squares back to pixels; the last rows and columns may be in no square.
-        large = block_replicate(squares, size, conserve_sum=False)
-        new = np.pad(large, [(0, n - m) for n, m in zip(mask.shape, large.shape, strict=True)])
-        new &= ~mask
-        mask |= new
-        if new.any():
-            notes.append(f"{np.count_nonzero(new)} pixels of {kind}")
+        pixels = block_replicate(squares, square_px, conserve_sum=False)
+        margins = [(0, n - m) for n, m in zip(mask.shape, pixels.shape, strict=True)]
+        new_mask = np.pad(pixels, margins) & ~mask
+        mask |= new_mask
+        if new_mask.any():
+            notes.append(f"{np.count_nonzero(new_mask)} pixels of {kind}")
     return replace(bad_pixels, mask=mask, notes=tuple(notes))
 
 
 def find_spikes(
     image: np.ndarray, bad: np.ndarray, sky: SkyLevel, is_saturated: np.ndarray
 ) -> np.ndarray:
-    """Find straight and narrow light that starts at the cores of saturated stars.
+    """Find straight, narrow features that start at the cores of saturated stars.
 
     These are diffraction spikes, in any number and direction, and charge that bleeds along
     columns: along a ray from the core, they are brighter than the halo for at least 24 px.
 
     Parameters
     ----------
-    image, bad, is_saturated : ndarray, shape (h, w)
-        Finite image; True for pixels that are left out, and for saturated ones.
+    image : ndarray, shape (h, w)
+        Image of finite values.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that are left out of the search.
     sky : SkyLevel
         Sky of the image.
+    is_saturated : ndarray of bool, shape (h, w)
+        Saturated pixels.
 
     Returns
     -------
@@ -115,24 +127,24 @@ def find_spikes(
     shape = angles, reach_px
     for x, y, core_px in find_saturated_cores(is_saturated):
         middle = y, x
-        first = int(2.0 * core_px / part_px) + 1
-        # Rays do not reach beyond a core as wide as an image whose level of saturation is wrong.
-        if first >= parts:
+        first_part = int(2.0 * core_px / part_px) + 1
+        # A core as long as the rays has none; the level of saturation is probably wrong.
+        if first_part >= parts:
             continue
-        # S/N in parts of 8 px of rays every half degree, without the halo: the median of all rays.
+        # Lower and upper quartiles of the S/N in parts of 8 px of rays, one ray every half degree.
         rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
         quartiles = np.percentile(rays.reshape(angles, parts, part_px), [25, 75], axis=2)
-        quartiles = quartiles[:, :, first:]
+        quartiles = quartiles[:, :, first_part:]
         is_outside = ~np.isfinite(quartiles)
         quartiles[is_outside] = 0.0
-        number = np.arange(1, parts - first + 1)
+        part_number = np.arange(1, parts - first_part + 1)
         end_px = np.zeros(angles)
-        # Faint spikes are seen in several parts together, by a low percentile of these, which stars
-        # in some of them do not change.
+        # Bright spikes are found in single parts, faint ones in five parts together, by the second
+        # lowest of these, which stars in some parts do not change.
         for run in (1, 5):
             light = scipy.ndimage.rank_filter(quartiles, run // 3, (1, 1, run), mode="mirror")
-            # Without the halo, which may be uneven or off its middle: the median within 30° at the
-            # same distance, of every eighth ray. A spike is narrower.
+            # Subtract the halo, which may be uneven or off centre: the median of every eighth ray
+            # within ±30° at the same distance. A spike is narrower.
             halo = scipy.ndimage.median_filter(light[:, ::8], (1, 15, 1), mode="wrap")
             light = np.ma.array(light - np.repeat(halo, 8, axis=1), mask=is_outside)
             # The lower quartile of a part: a row of separate stars has dark gaps, a spike has none.
@@ -140,41 +152,43 @@ def find_spikes(
             # Parts with light: 0.6 σ is three times the noise of a part.
             scatter = SIGMA_OF_MAD * np.ma.median(np.abs(low), axis=0)
             limit = np.maximum(4.0 * scatter.filled(np.inf), 0.6 / np.sqrt(run))
-            # Spikes come in opposite pairs, of which each is evidence of the other.
+            # Spikes come in opposite pairs: each is evidence of the other.
             pair_light = np.ma.minimum(low, np.roll(low, angles // 2, axis=0))
             is_light = (low > limit).filled(False) | (pair_light > 0.5 * limit).filled(False)
             is_light &= (low > 0.4 * high).filled(False)
-            # A ray ends at the last part with light, of which three of four from the core on have
-            # some, but for the first ones in which the halo is so uneven that it hides spikes.
+            # A spike ends at the last part with light up to which at least three of four parts from
+            # the core on have light. The first parts may be dark where the halo is so uneven that
+            # it hides spikes.
             is_hidden = np.logical_and.accumulate(limit > 2.0 * np.median(limit))
             count = np.cumsum(is_light, axis=1)
             is_ray = is_light & (count >= 0.75 * np.cumsum(is_light | ~is_hidden, axis=1))
-            length = (is_ray & (count >= max(3, run))) * number
-            end_px = np.maximum(end_px, (first + length.max(axis=1)) * part_px)
-        # Pixels of these rays from the core on, in a window about it.
+            length = (is_ray & (count >= max(3, run))) * part_number
+            end_px = np.maximum(end_px, (first_part + length.max(axis=1)) * part_px)
+        # Pixels of these rays outside the core, in a window around it.
         window, _ = overlap_slices(image.shape, (2 * reach_px + 1,) * 2, (int(y), int(x)))
         row, column = np.mgrid[window] - np.array(middle)[:, None, None]
         turns = np.arctan2(row, column) / (2.0 * np.pi) % 1.0
         ray = (turns * angles).astype(int) % angles
         radius = np.hypot(row, column)
         spikes[window] |= (
-            (end_px[ray] > first * part_px) & (radius < end_px[ray]) & (radius > core_px)
+            (end_px[ray] > first_part * part_px) & (radius < end_px[ray]) & (radius > core_px)
         )
     return np.asarray(scipy.ndimage.binary_dilation(spikes, np.ones((3, 3)), 2))
 
 
 def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
-    """Return middles and radii of the cores of saturated stars: x, y and r in px, (k, 3).
+    """Return the centres and radii of the cores of saturated stars: x, y and r in px, (k, 3).
 
-    A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The middle
-    is its widest point, in whatever direction its charge bleeds.
+    A core has at least four pixels; the 50 largest ones of an image (h, w) are returned. The centre
+    is the point farthest from the edge of the core, in whatever direction its charge bleeds; the
+    radius is its distance from the edge.
     """
     label, _ = scipy.ndimage.label(is_saturated, np.ones((3, 3)))
     boxes, area = scipy.ndimage.find_objects(label), np.bincount(label.ravel())[1:]
     largest = np.argsort(-area, kind="stable")[: min(50, np.count_nonzero(area >= 4))]
     cores = np.empty((len(largest), 3))
     for core, index in zip(cores, largest, strict=True):
-        # Distance of each pixel from the edge of the core; the mean of the farthest ones.
+        # Distance of each pixel from the edge of the core; the mean position of the farthest ones.
         core_mask = np.pad(label[boxes[index]] == index + 1, 1)
         depth = scipy.ndimage.distance_transform_edt(core_mask)[1:, 1:]
         row, column = np.argwhere(depth == depth.max()).mean(axis=0)
@@ -183,17 +197,17 @@ def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
 
 
 def smooth_light(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> np.ndarray:
-    """Return an image (h, w) above its sky, smoothed by 3 × 3 px: its noise is σ/3."""
+    """Return an image (h, w) minus its sky, smoothed over 3 × 3 px: its noise is σ/3."""
     return np.asarray(scipy.ndimage.uniform_filter(fill_bad(image - sky.level, bad)[0], 3))
 
 
 def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.ndarray, int]:
-    """Find the pixels of trails in an image, each of at least 100 px and a sixth of the image.
+    """Find trails in an image, each at least 100 px and a sixth of the shorter side long.
 
     Parameters
     ----------
     image : ndarray, shape (h, w)
-        Finite pixels.
+        Image of finite values.
     bad : ndarray of bool, shape (h, w)
         Pixels that are left out of the search.
     sky : SkyLevel
@@ -207,34 +221,34 @@ def find_trails(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> tuple[np.n
         Number of trails.
     """
     mask, count = np.zeros(image.shape, dtype=bool), 0
-    shortest_px = max(100, min(image.shape) // 6)
-    flat, noise = np.where(bad, 0.0, smooth_light(image, bad, sky)), sky.noise / 3.0
-    # Connected pixels that may be a part of a trail, the longest 20 of them; a line is searched in
-    # each, off the trails so far, until none is left.
-    label, _ = scipy.ndimage.label(flat > 4.0 * noise, np.ones((3, 3)))
+    min_length_px = max(100, min(image.shape) // 6)
+    smooth_image, noise = np.where(bad, 0.0, smooth_light(image, bad, sky)), sky.noise / 3.0
+    # Groups of connected bright pixels that may be part of a trail. In each of the 20 longest ones,
+    # up to four lines are searched, among the pixels outside the trails found so far.
+    label, _ = scipy.ndimage.label(smooth_image > 4.0 * noise, np.ones((3, 3)))
     boxes = scipy.ndimage.find_objects(label)
     length = np.array([np.hypot(*(part.stop - part.start for part in box)) for box in boxes])
     for index in np.argsort(-length, kind="stable")[:20]:
-        # Pixels of this source, counted from the corner of the image.
+        # Pixels of this group, in pixels of the image.
         box = boxes[index]
         row, column = np.nonzero((label[box] == index + 1) & ~mask[box])
         row, column = row + box[0].start, column + box[1].start
         for _ in range(4):
-            if min(length[index], len(row)) < shortest_px / 4:
+            if min(length[index], len(row)) < min_length_px / 4:
                 break
-            trail = trail_on_line(line_through(column, row), flat, noise, shortest_px)
+            trail = trail_on_line(line_through(column, row), smooth_image, noise, min_length_px)
             if trail is None:
                 break
             mask |= trail
             count += 1
-            # Another trail may cross it: the pixels off this one are searched again.
+            # Another trail may cross it: the pixels outside this one are searched again.
             is_left = ~trail[row, column]
             row, column = row[is_left], column[is_left]
     return mask, count
 
 
 def line_through(x: np.ndarray, y: np.ndarray) -> Line:
-    """Return the line on which most of some pixels (n,) lie (Hough 1962, US patent 3069654).
+    """Return the line on which most of the pixels (n,) lie (Hough 1962, US patent 3069654).
 
     Parameters
     ----------
@@ -251,18 +265,18 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
     sample = np.s_[:: max(1, len(x) // 5000)]
     for angle in np.deg2rad(np.arange(0.0, 180.0, 0.5)):
         across = Line(float(angle), 0.0).across(x[sample], y[sample])
-        least = float(across.min())
-        count = np.bincount(((across - least) / 2.0).astype(int))
+        smallest = float(across.min())
+        count = np.bincount(((across - smallest) / 2.0).astype(int))
         if count.max() > most_pixels:
             most_pixels = int(count.max())
-            line = Line(float(angle), least + 2.0 * float(count.argmax()) + 1.0)
-    # Least squares on the pixels nearby: offset and slope along the line.
+            line = Line(float(angle), smallest + 2.0 * float(count.argmax()) + 1.0)
+    # Least-squares fit of angle and distance to the pixels near the line, three times.
     for reach_px in (5.0, 3.0, 3.0):
         across, along = line.across(x, y), line.along(x, y)
         is_near = np.abs(across) < reach_px
         if np.count_nonzero(is_near) < 10:
             break
-        # A line that is turned by −arctan(slope) follows the pixels; its distance is their mean.
+        # The line turned by −arctan(slope) follows the pixels; its distance is their mean distance.
         slope, _ = np.polyfit(along[is_near], across[is_near], 1)
         central = Line(line.angle_rad - float(np.arctan(slope)), 0.0)
         line = central._replace(distance_px=float(np.mean(central.across(x[is_near], y[is_near]))))
@@ -270,7 +284,7 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
 
 
 def trail_on_line(
-    line: Line, flat: np.ndarray, noise: np.ndarray, shortest_px: int
+    line: Line, smooth_image: np.ndarray, noise: np.ndarray, min_length_px: int
 ) -> np.ndarray | None:
     """Return the pixels (h, w) of the trail on a line; None without a trail.
 
@@ -278,53 +292,54 @@ def trail_on_line(
     ----------
     line : Line
         The line on which a trail is searched.
-    flat, noise : ndarray, shape (h, w)
-        Smoothed image without its sky, and its σ.
-    shortest_px : int
-        Minimum length of a trail.
+    smooth_image, noise : ndarray, shape (h, w)
+        Smoothed image minus its sky, in any unit, and its σ.
+    min_length_px : int
+        Minimum length of a trail in px.
     """
-    # Pixels within 21 px of the line, and those in the middle of it.
-    height, width = flat.shape
+    # Pixels within 21 px of the line; the middle of a trail is within 1 px.
+    height, width = smooth_image.shape
     row, column = np.nonzero(np.abs(line.across(np.arange(width), np.arange(height)[:, None])) < 21)
-    light, ring = flat[row, column], np.abs(line.across(column, row))
+    light, distance_px = smooth_image[row, column], np.abs(line.across(column, row))
     along = line.along(column, row)
-    middle = ring < 1.0
-    # Parts of the line, 8 px long, with a mean S/N of 2 in the middle: the S/N is of smoothed
-    # pixels, of which a mean has half the noise.
+    middle = distance_px < 1.0
+    # Parts of the line, 8 px long, with a mean S/N above 2 in the middle. The S/N is per smoothed
+    # pixel; the mean of a part has about half their noise.
     part_px = 8
     part = ((along - along.min()) / part_px).astype(int)
     pixels = np.bincount(part[middle])
     snr = light[middle] / noise[row, column][middle]
     is_bright = (np.bincount(part[middle], snr) > 2.0 * pixels) & (pixels > 0)
-    # The longest run of these, gaps of two parts closed.
+    # The longest run of bright parts, with gaps of up to two parts closed.
     has_light = (np.convolve(np.pad(is_bright, 2), np.ones(3), "same") > 0)[2:-2]
     edges = np.flatnonzero(np.diff(np.pad(has_light.astype(np.int8), 1)))
     if not edges.size:
         return None
     longest = int((edges[1::2] - edges[::2]).argmax())
     start, end = int(edges[2 * longest]), int(edges[2 * longest + 1])
-    if (end - start) * part_px < shortest_px or is_bright[start:end].mean() < 0.85:
+    if (end - start) * part_px < min_length_px or is_bright[start:end].mean() < 0.85:
         return None
-    # A row of separate stars has dark gaps; a trail may be uneven, but has light all along: of the
-    # heights over 2 px in a part and the next one, the 15th percentile is at least 0.3 of the 85th.
+    # A row of separate stars has dark gaps; a trail may be uneven, but has light all along. Of the
+    # means over 2 px in each two successive parts, the 15th percentile is divided by the 85th; the
+    # median of these ratios is at least 0.3 for a trail.
     short_part = ((along - along.min())[middle] / 2.0).astype(int)
     means = np.bincount(short_part, light[middle]) / np.maximum(np.bincount(short_part), 1)
-    heights = means[4 * start : 4 * (end - 1)].reshape(-1, 4)
-    low, high = np.percentile(np.hstack([heights[:-1], heights[1:]]), [15, 85], axis=1)
+    means_2px = means[4 * start : 4 * (end - 1)].reshape(-1, 4)
+    low, high = np.percentile(np.hstack([means_2px[:-1], means_2px[1:]]), [15, 85], axis=1)
     if np.median(low / np.maximum(high, 1e-30)) < 0.3:
         return None
-    # Half width: the distance at which the median height is half the noise of a pixel, σ/2 = 1.5
-    # σ/3; a trail is narrower than 40 px, and than a tenth of its length, or it is a filament of a
-    # nebula.
+    # Half-width: the distance at which the median light falls below half the noise σ of a pixel of
+    # the image, σ/2 = 1.5 · σ/3. A trail is narrower than 40 px and than a tenth of its length;
+    # anything wider may be a filament of a nebula.
     inside = (part >= start) & (part < end)
     for half_px in range(2, 20):
         # A strip of 1 px on either side at this distance.
-        edge = inside & (ring >= half_px) & (ring < half_px + 1)
+        edge = inside & (distance_px >= half_px) & (distance_px < half_px + 1)
         if edge.any() and np.median(light[edge]) < 1.5 * np.median(noise[row, column][edge]):
             if (end - start) * part_px <= 20 * half_px:
                 return None
-            trail = np.zeros(flat.shape, dtype=bool)
-            is_trail = inside & (ring < half_px + 1)
+            trail = np.zeros(smooth_image.shape, dtype=bool)
+            is_trail = inside & (distance_px < half_px + 1)
             trail[row[is_trail], column[is_trail]] = True
             return trail
     return None

@@ -319,6 +319,9 @@ def test_a_model_without_a_field_has_no_range_of_magnitudes(shipped):
         ({"stamps": np.zeros((3, 16, 16), complex)}, "complex128"),
         ({"saturated": np.zeros((2, 16, 16))}, r"saturated .*\(2, 16, 16\)"),
         ({"noise": "many"}, "noise"),
+        ({"noise": -1.0}, "noise: expected numbers of at least 0"),
+        ({"gain": 0.0}, "gain: expected numbers above 0"),
+        ({"flux": np.ones(2)}, r"flux of shape \(2,\), expected one number, or .* 3 stamps"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_numbers(shipped, arguments, message):

@@ -429,6 +429,21 @@ def test_spikes_of_saturated_stars_are_left_out_and_their_cores_are_not(clean, a
     assert not found.mask[light == 6e4].any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_large_images_are_searched_in_squares_that_may_have_no_good_pixel():
+    rng, side = np.random.default_rng(4), 2000
+    image = rng.normal(100.0, 5.0, (side, side)).astype(np.float32)
+    row, column = np.indices(image.shape)
+    is_trail = np.abs(row - column) < 4
+    bad = np.zeros(image.shape, bool)
+    bad[100:140, 1000:1040] = True
+    image[is_trail] += 30.0
+    result = add_trails(image, bad_pixels.BadPixels(bad, bad & False, ()), np.inf)
+    assert result.mask[is_trail].mean() > 0.95 and result.mask[bad].all()
+    assert result.mask[np.abs(row - column) > 30].mean() < 1.1 * bad.mean()
+    assert len(result.notes) == 1 and result.notes[0].endswith("pixels of a satellite trail")
+
+
 def test_stars_around_saturated_ones_are_no_spikes():
     """In a crowded field, rays pass many stars; hardly any is a spike."""
     rng = np.random.default_rng(3)

@@ -73,6 +73,16 @@ def test_columns_with_units(image, place):
         positions(image, QTable({"x_fit": place[:, 0] * u.arcsec, "y_fit": place[:, 1]}))
 
 
+@pytest.mark.parametrize("missing", [None, np.nan, pd.NA])
+@pytest.mark.parametrize("kind", [dict, pd.DataFrame])
+def test_none_and_na_objects_are_missing_values(kind, missing):
+    columns = {"x": [1.0, 2.0], "y": [3.0, 4.0], "mag": [5.0, missing], "id": ["None", missing]}
+    objects = {name: np.array(values, dtype=object) for name, values in columns.items()}
+    catalogue = as_catalogue(kind(objects))
+    np.testing.assert_array_equal(catalogue.numbers("mag"), [5.0, np.nan])
+    assert catalogue.identifiers().tolist() == ["None", ""]
+
+
 # Files.
 
 

@@ -280,3 +280,27 @@ def test_wings_of_several_images_are_one_profile():
     light = np.array([0.03])
     joined = Wings.join([wings, doubled]).total_over_flux(light)[0]
     assert joined == pytest.approx(wings.total_over_flux(light)[0])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ({}, None),
+        ({"radius_px": [5.0, 8.0, 20.0]}, "geometric sequence"),
+        ({"radius_px": [5.0, 5.0, 5.0]}, "geometric sequence"),
+        ({"radius_px": [5.0, 10.0]}, "different lengths"),
+        ({"profile": "wide"}, "not numbers"),
+        ({"profile": [1e-5, [1e-4, 3e-5]]}, "not numbers"),
+        ({"outer_share": None}, "not numbers"),
+        ({"outer_share": -0.02}, "fraction of a star"),
+        ({"profile": [1.0, 1.0, 1.0]}, "fraction of a star"),
+    ],
+)
+def test_damaged_wings_raise_an_error_that_says_what_is_wrong(damage, message):
+    wings = Wings(np.array([5.0, 10.0, 20.0]), np.array([1e-5, 1e-4, 3e-5]), np.eye(3), 0.02)
+    plain = wings.plain() | damage
+    if message is None:
+        assert Wings.from_plain(plain).plain() == plain
+        return
+    with pytest.raises(ValueError, match=message):
+        Wings.from_plain(plain)
