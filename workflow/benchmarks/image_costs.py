@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FIELDS = {"s512": (512, 120, 80), "s900": (900, 200, 500), "s2048": (2048, 500, 1500)}
 """Side in px, and numbers of bright and of faint stars, of each simulated image."""
 
-BEFORE = "e20301a"  # the commit of the times that issue 68 lists
+BEFORE = "e20301a"  # before spikes, halos and shared noise were measured
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")}
 EVERY_S = 0.02  # between looks at the memory of a process
 SIMULATE = """
