@@ -284,10 +284,10 @@ def sections(words: Sequence[str]) -> dict[str, list[str]]:
     # Headings of all packages, in their order; packages may share a heading.
     available: dict[str, list[str]] = {}
     for package in map(import_module, _packages()):
-        required = getattr(package, "REQUIRED", {})
+        requirements = getattr(package, "REQUIRED", {})
         for heading, commands in getattr(package, "SECTIONS", {}).items():
             for word in commands:
-                if word in words and (word not in required or find_spec(required[word])):
+                if word in words and (word not in requirements or find_spec(requirements[word])):
                     available.setdefault(heading, []).append(word)
     return available
 

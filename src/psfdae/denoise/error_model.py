@@ -157,8 +157,11 @@ class ErrorModel:
     @classmethod
     def build_uncalibrated(cls, noise: np.ndarray, half_width68: np.ndarray) -> ErrorModel:
         """Return errors whose factors are 1, and whose distance limit is 0."""
-        ones, scale = np.ones(len(noise)), np.ones((len(noise), 2, len(Estimated), 2))
-        return cls(noise, half_width68, ones, scale, scale, ones, distance_limit=0.0)
+        unit_factor, scale = (
+            np.ones(len(noise)),
+            np.ones((len(noise), 2, len(Estimated), 2)),
+        )
+        return cls(noise, half_width68, unit_factor, scale, scale, unit_factor, distance_limit=0.0)
 
     @staticmethod
     def shapes(nodes: int, stamp_px: int) -> dict[str, tuple[int, ...]]:

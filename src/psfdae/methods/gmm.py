@@ -107,19 +107,19 @@ class GaussianMixture(MixturePrior, Method):
         """
         # With a single value of K and of ν, nothing is chosen, and all stars are used for the fit.
         is_search = len(gmm.components) * len(gmm.shrinkage) > 1
-        fitted, validation = (data.train, data.train[:0])
+        fit_rows, validation = (data.train, data.train[:0])
         if is_search:
-            fitted, validation = data.fit, data.validation
-        fitted = fitted[: gmm.stars]
+            fit_rows, validation = data.fit, data.validation
+        fit_rows = fit_rows[: gmm.stars]
         if is_search and not validation.size:
             # Without validation stars, every tenth training star is used as one.
-            validation, fitted = fitted[::10], np.delete(fitted, np.s_[::10])
+            validation, fit_rows = fit_rows[::10], np.delete(fit_rows, np.s_[::10])
         # A cluster has at least one star.
-        sizes = [k for k in gmm.components if k <= fitted.size]
+        sizes = [k for k in gmm.components if k <= fit_rows.size]
         if not sizes:
             raise FitError(
                 f"{next(iter(cls.groups))}.components = {gmm.components}: "
-                f"must be at most {fitted.size}, the number of training stars"
+                f"must be at most {fit_rows.size}, the number of training stars"
                 f"{' without the validation stars' if is_search else ''}"
             )
         # The final mixture is fitted to the validation stars, too.
@@ -127,7 +127,7 @@ class GaussianMixture(MixturePrior, Method):
         if is_search:
             k, nu, uses_position = best_on_validation(
                 lambda k, uses_position: cls.fit_clusters(
-                    data, fitted, k, gmm.shrinkage[0], uses_position, gmm
+                    data, fit_rows, k, gmm.shrinkage[0], uses_position, gmm
                 ),
                 data,
                 validation,

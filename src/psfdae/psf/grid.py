@@ -94,13 +94,13 @@ class PsfGrid:
         """
         node, share = self._nodes(centre, np.full(len(centre), np.nan) if flux is None else flux)
         flat = self.splines.reshape(len(self.splines), -1)
-        mixed = np.empty((len(centre), flat.shape[1]), np.float32)
+        mean_spline = np.empty((len(centre), flat.shape[1]), np.float32)
         share = share.astype(np.float32)
         # Batches with 2^21 coefficients of nodes, for memory.
         count = node.size * flat.shape[1] // 2**21 + 1
         for batch in np.array_split(np.arange(len(centre)), count):
-            mixed[batch] = (share[batch, None] @ flat[node[batch]])[:, 0]
-        return mixed.reshape(len(centre), *self.splines.shape[1:])
+            mean_spline[batch] = (share[batch, None] @ flat[node[batch]])[:, 0]
+        return mean_spline.reshape(len(centre), *self.splines.shape[1:])
 
     def outer_shares(self, centre: np.ndarray, flux: np.ndarray, side_px: int) -> np.ndarray:
         """Return `psfdae.psf.wings.outer_shares` of stars from the PSFs of the nodes around them.
@@ -169,16 +169,16 @@ class PsfGrid:
         # Batches, for memory: a pixel needs 16 coefficients.
         for batch in np.array_split(stars, len(stars) * side_px**2 // 2**17 + 1):
             if splines is None:
-                mixed = self.mix_splines(centre[batch], None if flux is None else flux[batch])
+                mean_spline = self.mix_splines(centre[batch], None if flux is None else flux[batch])
             else:
-                mixed = splines[batch]
-            mixed = np.pad(mixed, ((0, 0), *[(room, room)] * 2))
+                mean_spline = splines[batch]
+            mean_spline = np.pad(mean_spline, ((0, 0), *[(room, room)] * 2))
             # View of the 4 × 4 taps of all pixels of a stamp that begins at any coefficient:
             # pixels are o coefficients apart.
-            star_step, down, across = mixed.strides
+            star_step, down, across = mean_spline.strides
             taps = np.lib.stride_tricks.as_strided(
-                mixed,
-                (len(mixed), *[end + 2 * room - span + 1] * 2, 4, 4, side_px, side_px),
+                mean_spline,
+                (len(mean_spline), *[end + 2 * room - span + 1] * 2, 4, 4, side_px, side_px),
                 (star_step, down, across, down, across, between * down, between * across),
                 writeable=False,
             )

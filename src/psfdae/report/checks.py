@@ -107,8 +107,10 @@ def comparison_sentence(errors: Table, method: str, label: str) -> str:
     sentence = f"{label}: at S/N {snr:.3g} the MSE is {mean[snr]:.2f} times the MSE of one mean PSF"
     if linear and method != "lmmse":
         sentence += f", {linear[snr]:.2f} times the MSE of linear MMSE"
-    worse = ", ".join(f"{snr:.3g}" for snr, ratio in mean.items() if ratio >= 1)
-    verdict = f"no better than the mean PSF at S/N {worse}" if worse else "better at each S/N"
+    worse_snr = ", ".join(f"{snr:.3g}" for snr, ratio in mean.items() if ratio >= 1)
+    verdict = (
+        f"no better than the mean PSF at S/N {worse_snr}" if worse_snr else "better at each S/N"
+    )
     return f"{sentence}; {verdict} ({errors['stars'][0]} stars held out)"
 
 

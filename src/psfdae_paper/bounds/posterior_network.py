@@ -184,8 +184,8 @@ class FreshStars:
         seidel = columns.get("seidel", np.empty((len(field), 0)))
         times = compute_symmetry_weights(field, peak, points)
         # Mirrored stars are at mirrored fields, which may be left out.
-        mirrored = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
-        star, symmetry = np.nonzero(times * fields[mirrored])
+        mirror_field = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
+        star, symmetry = np.nonzero(times * fields[mirror_field])
         choices = np.stack([star, symmetry], axis=1).repeat(times[star, symmetry], axis=0)
         # Windows of all symmetries and centring errors, as pixels of the flat frame.
         size, side = frames.shape[-1], framing.stamp_px
