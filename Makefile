@@ -64,7 +64,7 @@ benchmark stability bounds bundles:
 	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
 	  --against "$$AGAINST" --preset "$${PRESET:-fast}" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
 	"benchmark images") python workflow/benchmarks/image_costs.py $$IMAGES --against "$$AGAINST" \
-	  --out "$$PSFDAE_RESULTS/tables/benchmark_images.csv";; *) $(LOCKED) -- $@;; esac
+	  --results "$$PSFDAE_RESULTS";; *) $(LOCKED) -- $@;; esac
 night: env ## Model the images of a night: IMAGES="night/*.fits", or a CSV list of images
 	@$(LOCKED) images="$$IMAGES" -- night
 

@@ -32,7 +32,7 @@ def readme():
     yield f"{run['matrix_product_gflops']:.0f} GFLOP/s in matrix products)"
     environment_gb = run["environment_mb"] / 1e3
     yield f"| `make env`, once | {run['install_s'] / 60:.1f} min | | {environment_gb:.1f} GB |"
-    reproduce = f"{run['wall_s'] / 60:.1f} min | {run['peak_mb'] / 1e3:.1f} GB"
+    reproduce = f"{run['wall_s'] / 60:.1f} min | {tables.MB_PER_MIB * run['peak_mb'] / 1e3:.1f} GB"
     yield f"| `make reproduce` | {reproduce} | {run['results_mb'] / 1e3:.1f} GB |"
     yield f"| `make test` | {run['tests_s'] / 60:.1f} min | | |"
     yield f"took {run['cpu_s'] / 60:.1f} min of CPU time"
@@ -130,7 +130,7 @@ def report():
     speed = tables.read_record("tables/predict_throughput.csv").iloc[0]
     rates = f"a network takes {speed.predict_per_s:.0f} and a mixture {speed.mixture_per_s:.0f}"
     yield f"with {speed.threads:.0f} threads, {rates} stamps of {speed.stamp_px:.0f} × "
-    yield f"in at most {speed.peak_mb:.0f} MB"
+    yield f"in at most {tables.MB_PER_MIB * speed.peak_mb:.0f} MB"
 
 
 def own_telescope():

@@ -46,6 +46,9 @@ HEADINGS = {
     "field": "field",
 }
 """Headings of the columns of methods."""
+MB_PER_MIB = 2**20 / 1e6
+"""Columns `peak_mb` and `memory_mb` are in MiB, but those of `scaling_stages.csv`; pages in MB."""
+
 LEVEL = {"dataset": "{dataset}", "λ": "{noise_level}"}
 """Columns that name a noise level."""
 
@@ -400,8 +403,9 @@ def outliers() -> pd.DataFrame:
 
 def night_cost() -> pd.DataFrame:
     """Processor time, memory and sizes of files of an image of a night."""
+    table = read_study("night_cost/table.csv")
     return formatted(
-        read_study("night_cost/table.csv"),
+        table.assign(memory_mb=MB_PER_MIB * table.memory_mb),
         **{
             "side, px": "{side_px}",
             "stars": "{stars:.0f}",

@@ -178,7 +178,9 @@ def convert_metric(name: str, value: float) -> tuple[str, float]:
     return f"{stem}{unit}{level.replace('_', '/')}", 1e6 * value if unit else value
 
 
-def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[TrackedRun]:
+def read_dataset_runs(
+    results: Path, datasets: Mapping[str, Path], target: str = ""
+) -> list[TrackedRun]:
     """Read the finished runs of datasets: a run for each method of each evaluation.
 
     Models still in training lack an evaluation. A method that is fitted once for both references
@@ -189,7 +191,9 @@ def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[Track
     results : Path
         Folder that the workflow writes to.
     datasets : mapping of str to Path
-        Product "stars" by name of the dataset.
+        Product "stars" by name of the dataset, or of the variant of a dataset.
+    target : str
+        Target of the workflow that evaluates them, for messages. [default: the dataset]
 
     Raises
     ------
@@ -203,7 +207,9 @@ def read_dataset_runs(results: Path, datasets: Mapping[str, Path]) -> list[Track
         folder = results / "evaluation" / dataset
         evaluations = sorted(folder.glob("*-*.csv"))
         if not evaluations:
-            raise ProductError(f"{folder}: no evaluations; run `snakemake {dataset}` first")
+            raise ProductError(
+                f"{folder}: no evaluations; run `snakemake {target or dataset}` first"
+            )
         for path in evaluations:
             table = read_table(path, "method", "noise_level", "metric", "value", "stderr")
             for name, rows in table.groupby("method", sort=False):

@@ -79,6 +79,26 @@ def test_a_mistyped_name_in_python_is_answered_with_the_one_meant(folder):
     assert done.stderr.splitlines()[-1].endswith("Did you mean: 'load_model'?")
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        (f"wavefront {LISTED} --telescope telescope.yaml --out o.fits --axis 3", "--axis"),
+        ("train image.fits --detect --out o --snr-min", "--snr-min"),
+        ("photometry image.fits --detect --model m --out o.csv --zero-point", "--zero-point"),
+        ("psf image.fits --out o.fits --at 1,", "--at"),
+    ],
+)
+def test_no_option_takes_a_number_that_is_not_finite(folder, monkeypatch, number, line, option):
+    monkeypatch.chdir(folder)
+    before = sorted(folder.iterdir())
+    gap = "" if line.endswith(",") else " "
+    run = psfdae(*f"{line}{gap}{number}".split())
+    assert run.exit_code == 2
+    assert option in run.stderr and number in run.stderr
+    assert sorted(folder.iterdir()) == before
+
+
 @pytest.mark.workflow
 @pytest.mark.parametrize(
     ("words", "meant"),

@@ -6,9 +6,13 @@ import sys
 
 import click
 import numpy as np
+import pandas as pd
 import pytest
+from astropy.io import fits
+from click.testing import CliRunner
 
 import costs
+import figures
 import image_costs
 import propagators
 import scenes
@@ -71,11 +75,19 @@ def test_knee_is_the_last_training_whose_time_is_worth_its_error():
 # Images
 
 
-def test_the_cost_of_a_command_is_its_own(tmp_path):
-    """Memory and CPU time of a process that takes 200 MB; a failure ends with what it printed."""
-    program = "import time; block = bytearray(200_000_000); time.sleep(0.3)"
-    cost = image_costs.measure_process([sys.executable, "-c", program], tmp_path, {})
-    assert 190 < cost["peak_mb"] < 260 and 0.0 < cost["cpu_s"] < 5.0
+@pytest.mark.parametrize("depth", [0, 2])
+def test_the_cost_of_a_command_is_its_own_with_the_processes_that_it_starts(tmp_path, depth):
+    """Memory of 200 MB and 0.3 s of CPU time; a failure ends with what it printed."""
+    program = "import time; block = bytearray(200_000_000)\nwhile time.process_time() < 0.3: pass"
+    words = [sys.executable, "-I", "-S", "-c", program]
+    for _ in range(depth):
+        text = f"import subprocess; subprocess.run({words}, check=True)"
+        words = [sys.executable, "-I", "-S", "-c", text]
+    # The memory of this process, which starts it, does not count.
+    block = np.ones(40_000_000)
+    cost = image_costs.measure_process(words, tmp_path, {})
+    assert 200 < cost["peak_mb"] < 260 < block.nbytes / 1e6
+    assert 0.3 <= cost["cpu_s"] < 3.0
     with pytest.raises(click.ClickException, match="no such tool"):
         failure = "raise SystemExit('no such tool')"
         image_costs.measure_process([sys.executable, "-c", failure], tmp_path, {})
@@ -85,6 +97,42 @@ def test_an_earlier_commit_has_the_name_that_its_command_had(tmp_path):
     (tmp_path / "new/src/psfdae/commands").mkdir(parents=True)
     (tmp_path / "new/src/psfdae/commands/train.py").touch()
     trees = {"now": tmp_path / "new", "earlier": tmp_path / "old"}
-    runs = [*image_costs.list_runs(tmp_path / "i.fits", trees, tmp_path)]
-    names = {tool: words[3] for tool, step, words, _ in runs if step == "train" and tool in trees}
+    runs = [*image_costs.list_own_runs(tmp_path / "i.fits", trees, tmp_path)]
+    names = {tool: words[3] for tool, step, words, _ in runs if step == "train"}
     assert names == {"now": "train", "earlier": "from-stars"}
+
+
+def test_every_tool_gets_the_same_pixels_of_a_compressed_image(tmp_path):
+    """SExtractor reads no compressed file; names of images may have dots."""
+    image, folder = np.arange(6.0).reshape(2, 3), tmp_path / "copies"
+    folder.mkdir()
+    for name in ("m67.r.fits", "m67.r.fits.gz", "m67.r.fit"):
+        fits.writeto(tmp_path / name, image, overwrite=True)
+        copy = image_costs.write_image(tmp_path / name, folder)
+        assert copy == folder / "m67.r.fits"
+        assert copy.read_bytes()[:6] == b"SIMPLE"
+        np.testing.assert_array_equal(fits.getdata(copy), image)
+
+
+def test_growth_shows_the_slope_of_the_largest_images():
+    """Twice the stars take twice the time, and more pixels as much as before."""
+    sizes = [(10, 1e6), (100, 1e6), (200, 1e6), (100, 4e6)]
+    rows = [
+        {"tool": "psfdae", "step": step, "stars": stars, "pixels": pixels}
+        | {"cpu_s": max(stars, 100.0), "peak_mb": 300.0}
+        for stars, pixels in sizes
+        for step in ("train", "photometry")
+    ]
+    others = [{**row, "tool": "psfex", "cpu_s": 1.0} for row in rows]
+    figure = figures.image_growth(pd.DataFrame([*rows, *others, {**rows[0], "cpu_s": None}]))
+    labels = [[line.get_label() for line in axes.lines] for axes in figure.axes]
+    assert labels[0] == ["train, slope 1.00", "photometry, slope 1.00"]
+    assert labels[1] == ["train, slope 0.00", "photometry, slope 0.00"]
+
+
+@pytest.mark.parametrize("text", ["512", "512:x", "512:0", "8:10"])
+def test_sizes_that_are_none_are_refused(text):
+    options = ["--fields", text, "--results", "r"]
+    run = CliRunner().invoke(image_costs.compare_tools, options)
+    assert run.exit_code == 2
+    assert "expected words SIDE:STARS" in run.output

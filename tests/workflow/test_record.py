@@ -106,6 +106,14 @@ def test_record_holds_the_run_its_commit_and_its_costs(results, history, tmp_pat
     assert provenance["on_request_s"] == {"stability": 100.0}
 
 
+def test_a_cost_that_a_job_lacks_is_not_recorded(results, history, tmp_path):
+    """A sum without it would be too small."""
+    written(results / "logs/runtime/all.log", "killed\n")
+    history()
+    record.reference(results, tmp_path / "reference", [plan(results)])
+    assert recorded(tmp_path / "reference")["cpu_s"] is None
+
+
 def test_record_keeps_tables_that_take_long_with_their_commit(results, history, tmp_path):
     out, first = tmp_path / "reference", history()
     written(results / SLOW, "b\n2\n")

@@ -73,7 +73,7 @@ def summary(table, old, new):
             f"  {about} {seconds[1].sum():.0f} -> {seconds[0].sum():.0f} s: {ratio:.3f}{scatter}"
         )
     peaks = [f"{side.peak_mb.max():.0f}" for side in (first, second)]
-    return "\n".join([*lines, f"  largest job {peaks[0]} -> {peaks[1]} MB"])
+    return "\n".join([*lines, f"  largest job {peaks[0]} -> {peaks[1]} MiB"])
 
 
 def _tree(root, commit, folder):

@@ -27,7 +27,7 @@ WAYS = {
 
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
 COLORS = {"simulation": SERIES_COLORS[0], "inference": SERIES_COLORS[1]}
-COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MB)", "disk_mb": "disk (MB)"}
+COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MiB)", "disk_mb": "disk (MiB)"}
 LOGS = {"xscale": "log", "yscale": "log"}
 USED = {"marker": "*", "ms": 15, "mfc": "#f0e442", "mec": "black", "ls": "", "zorder": 5}
 RING = {"ls": "", "mfc": "none", "mec": "black", "zorder": 5}
@@ -65,7 +65,7 @@ SERIES = (
 
 @command("draw")
 def draw(
-    kind: Literal[*("propagation", "costs", "inference", "scaling", "graded")],
+    kind: Literal[*("propagation", "costs", "inference", "scaling", "image_growth", "graded")],
     table: Annotated[File, "Table of that benchmark."],
     out: Annotated[File, "PNG."],
     scene: Annotated[str | None, "Scene whose rows are drawn."] = None,
@@ -254,6 +254,36 @@ def scaling(table):
     panels[1].set_ylim(min(low, middle / 10), max(high, middle * 10))
     panels[1].set_xlim(panels[0].get_xlim())
     figure.suptitle("Growth of the costs, one run each (open: extrapolated; memory is not)")
+    return figure
+
+
+def image_growth(table):
+    """CPU time and memory of an image against its stars and its pixels, with slopes of the ends.
+
+    Against the stars are drawn images of the most frequent number of pixels, and the reverse.
+    """
+    table = table[table["tool"] == "psfdae"].dropna(subset=["stars", "cpu_s"])
+    figure = new_figure(6.0, layout="constrained")
+    panels, sizes = figure.subplots(2, 2, sharex="col", sharey="row"), ("stars", "pixels")
+    for column, against, other in zip(panels.T, sizes, sizes[::-1], strict=True):
+        same = table[other] == table.groupby(other)[against].nunique().idxmax()
+        steps = table[same].sort_values(against).groupby("step", sort=False)
+        for (step, rows), color in zip(steps, SERIES_COLORS, strict=False):
+            for axes, cost in zip(column, ("cpu_s", "peak_mb"), strict=True):
+                # Slope between the two largest sizes, where constant terms count least.
+                logs = np.log(rows[[against, cost]].to_numpy(float)[-2:])
+                growth, increase = logs[-1] - logs[0]
+                label = f"{step}, slope {increase / growth:.2f}" if growth else step
+                axes.plot(rows[against], rows[cost], marker="o", color=color, label=label)
+        column[0].set_title(f"{table[other][same].iloc[0]:,.0f} {other}")
+        column[1].set_xlabel(against)
+    for axes in panels.flat:
+        axes.set(**LOGS)
+        axes.grid(True)
+        axes.legend()
+    panels[0, 0].set_ylabel("CPU time (s)")
+    panels[1, 0].set_ylabel("peak memory (MB)")
+    figure.suptitle("Costs of an image, one run each (slopes between the two largest sizes)")
     return figure
 
 

@@ -4,43 +4,54 @@ Every tool gets the same images, one core, and only the pixels: it finds the sta
 are simulated fields of three sizes, and further ones of the user. psfdae runs at this commit and at
 an earlier one, with the same packages. PSFEx runs after SExtractor, whose photometry takes the PSF
 of PSFEx; EPSFBuilder and Piff get sources by photutils and make models alone. A tool that is not
-installed is left out.
+installed is left out; Piff may be in a folder that PYTHONPATH names.
+
+Then psfdae at this commit runs alone on fields of more and more stars, and of more and more pixels.
 """
 
+import gzip
 import os
 import shutil
 import subprocess
 import sys
 import tarfile
-import time
+from dataclasses import replace
 from importlib.util import find_spec
 from io import BytesIO
+from itertools import chain
+from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
 
-from psfdae.base.files import write_text
+from figures import image_growth
+from psfdae.base.figures import apply_style, write_png
+from psfdae.base.files import write_csv
 
 ROOT = Path(__file__).resolve().parents[2]
-FIELDS = {"s512": (512, 120, 80), "s900": (900, 200, 500), "s2048": (2048, 500, 1500)}
-"""Side in px, and numbers of bright and of faint stars, of each simulated image."""
+FIELDS = "512:200 900:700 2048:2000"
+GROWTH = "512:300 1024:300 2048:300 4096:300 8192:300 " + " ".join(
+    f"4096:{stars}" for stars in (100, 1000, 3000, 10_000, 30_000)
+)
+"""Side in px and number of stars of each simulated image, for all tools and for psfdae alone."""
 
 BEFORE = "e20301a"  # before spikes, halos and shared noise were measured
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")}
-EVERY_S = 0.02  # between looks at the memory of a process
-SIMULATE = """
-import sys
-from dataclasses import replace
-from astropy.io import fits
-from psfdae_paper.stars.nights import NightRecipe, simulate_night, simulate_reference_stars
-out, side, bright, faint = sys.argv[1], *map(int, sys.argv[2:])
-recipe = NightRecipe()
-recipe = replace(recipe, field=replace(recipe.field, side_px=side, bright=bright, faint=faint))
-counts, cards, _ = next(simulate_night(recipe, simulate_reference_stars(recipe, 1), 1))
-fits.PrimaryHDU(counts, fits.Header(list(cards.items()))).writeto(out)
+MEASURE = """
+import os, resource, sys
+_, status = os.waitpid(os.posix_spawnp(sys.argv[2], sys.argv[2:], os.environ), 0)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+peak_b = used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+with open(sys.argv[1], "w") as file:
+    print(used.ru_utime + used.ru_stime, peak_b, file=file)
+sys.exit(status != 0)
 """
-"""Program that writes the first exposure of a simulated night."""
+"""Program that runs a command, and writes what it and its descendants used to a file.
+
+These are CPU seconds of all together and bytes of the largest one. The system's peak of a process
+is not below the memory of the process that started it, which is therefore this small program.
+"""
 
 SOURCES = """
 import sys
@@ -93,35 +104,91 @@ SEXTRACTOR = "-c /dev/null -FILTER N -DETECT_THRESH 5 -ANALYSIS_THRESH 5 -CATALO
 COLUMNS = "NUMBER X_IMAGE Y_IMAGE FLUX_RADIUS FLUX_APER(1) FLUXERR_APER(1) ELONGATION FLAGS SNR_WIN"
 
 
+def parse_sizes(context, option, text):
+    """Return (side, stars) of each word of a text such as "512:200 900:700"."""
+    try:
+        sizes = [tuple(map(int, word.split(":"))) for word in text.split()]
+        if all(side >= 64 and stars >= 1 for side, stars in sizes):
+            return sizes
+    except ValueError:
+        pass
+    raise click.BadParameter(f"{text!r}: expected words SIDE:STARS, with sides of 64 px or more")
+
+
+SIZES = {"metavar": "SIZES", "callback": parse_sizes, "show_default": True}
+
+
 @click.command()
 @click.argument("image", nargs=-1, type=click.Path(exists=True, path_type=Path))
 @click.option("--against", default="", help=f"Commit that is compared with.  [default: {BEFORE}]")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="CSV of the costs.")
-def compare_tools(image: tuple[Path, ...], against: str, out: Path) -> None:
+@click.option("--fields", default=FIELDS, **SIZES, help="SIDE:STARS of simulated images.")
+@click.option("--growth", default=GROWTH, **SIZES, help="The same, for psfdae alone.")
+@click.option("--results", required=True, type=click.Path(path_type=Path), help="Folder.")
+def compare_tools(image, against, fields, growth, results):
     """Time models and photometry of simulated images and of each IMAGE, on a quiet machine.
 
-    The table has a row for each image, tool and step.
+    The folder RESULTS gets tables/benchmark_images.csv, with a row for each image, tool and step,
+    without costs where the tool failed, and figures/benchmark/images.png, of the growth. Stars are
+    those that were simulated. The ratio of the CPU time to the earlier commit's is printed.
     """
-    rows = []
+    import pandas as pd
+    from astropy.io import fits
+
+    rows, failures, commit = [], 0, against or BEFORE
+    # Images for all tools, then those for psfdae at this commit.
+    shared, alone = [*fields, *image], [size for size in growth if size not in fields]
     with TemporaryDirectory() as name:
-        folder = Path(name)
-        commit = against or BEFORE
-        trees = {"psfdae": ROOT, f"psfdae {commit}": extract_commit(commit, folder / "earlier")}
-        for label, size in FIELDS.items():
-            words = [sys.executable, "-c", SIMULATE, folder / f"{label}.fits", *size]
-            subprocess.run([*map(str, words)], check=True)
-        paths = (*(folder / f"{label}.fits" for label in FIELDS), *image)
-        for number, path in enumerate(paths):
+        trees = {"psfdae": ROOT, f"psfdae {commit}": extract_commit(commit, Path(name, "earlier"))}
+        for number, source in enumerate(shared + alone):
             # Images of different folders may have the same name.
-            place = folder / f"image{number}"
-            place.mkdir()
-            for tool, step, words, environment in list_runs(path.resolve(), trees, place):
-                row = {"image": path.stem, "tool": tool, "step": step}
-                rows.append(row | measure_process(words, place, environment))
-                print(*rows[-1].values(), flush=True)
+            folder = Path(name, f"image{number}")
+            folder.mkdir()
+            path = write_image(source, folder)
+            about = {"image": path.stem, "pixels": prod(fits.getdata(path).shape)}
+            about["stars"] = None if isinstance(source, Path) else source[1]
+            if number < len(shared):
+                runs = chain(list_own_runs(path, trees, folder), list_peer_runs(path, folder))
+            else:
+                runs = list_own_runs(path, {"psfdae": ROOT}, folder)
+            for tool, step, words, environment in runs:
+                row = about | {"tool": tool, "step": step, "cpu_s": None, "peak_mb": None}
+                try:
+                    row |= measure_process(words, folder, environment)
+                except click.ClickException as error:
+                    failures += 1
+                    click.echo(f"{path.stem}, {tool}, {step} failed: {error.message}", err=True)
+                rows.append(row)
+                print(*row.values(), flush=True)
                 # Written after each run, so that an interruption loses none.
-                lines = [",".join(map(str, line.values())) for line in rows]
-                write_text(out, "\n".join([",".join(rows[0]), *lines]) + "\n")
+                table = pd.DataFrame(rows)
+                write_csv(results / "tables/benchmark_images.csv", table)
+            shutil.rmtree(folder)
+    wide = table.pivot_table("cpu_s", ["image", "step"], "tool", sort=False).reindex(columns=trees)
+    print("CPU time over the earlier commit's:", (wide.psfdae / wide.iloc[:, 1]).dropna(), sep="\n")
+    if fields + growth:
+        write_png(apply_style(image_growth)(table), results / "figures/benchmark/images.png")
+    if failures:
+        raise click.ClickException(f"{failures} of {len(rows)} commands failed, see above")
+
+
+def write_image(source, folder):
+    """Write a simulated field of (side, stars), or a copy of an image; return its path."""
+    if isinstance(source, Path):
+        # SExtractor reads no compressed image.
+        path = folder / f"{source.name.split('.fit')[0]}.fits"
+        content = source.read_bytes()
+        path.write_bytes(gzip.decompress(content) if source.suffix == ".gz" else content)
+        return path
+    from psfdae_paper.stars.example import example_field, write_cube
+    from psfdae_paper.stars.nights import NightRecipe
+
+    # A quarter of the stars is bright enough for a model.
+    side, stars = source
+    path, sizes = folder / f"s{side}_{stars}.fits", {"bright": stars // 4, "side_px": side}
+    recipe = replace(NightRecipe().field, faint=stars - stars // 4, saturated=0, **sizes)
+    image = example_field(recipe, 1).image
+    write_cube(path, image, GAIN=recipe.gain, SATURATE=float(recipe.saturation))
+    return path
 
 
 def extract_commit(commit: str, folder: Path) -> Path:
@@ -133,19 +200,22 @@ def extract_commit(commit: str, folder: Path) -> Path:
     return folder
 
 
-def list_runs(image, trees, folder):
-    """Yield tool, step, words of the command, and its environment; each step follows the last."""
+def list_own_runs(image, trees, folder):
+    """Yield tool, step, words and environment of the commands of psfdae at each commit."""
     for number, (tool, tree) in enumerate(trees.items()):
         environment = {"PYTHONPATH": str(tree / "src")}
         is_renamed = (tree / "src/psfdae/commands/train.py").exists()
-        train = "train" if is_renamed else "from-stars"
         start = [sys.executable, "-m", "psfdae"]
-        model = folder / f"{image.stem}-{number}"
-        words = [*start, train, image, "--detect", "--method", "field", "--out", model]
-        yield tool, "train", words, environment
-        bundle = model / f"{image.stem}.psf.safetensors"
-        words = [*start, "photometry", image, "--detect", "--model", bundle]
-        yield tool, "photometry", [*words, "--out", folder / f"{model.name}.csv"], environment
+        train = [*start, "train" if is_renamed else "from-stars", image, "--method", "field"]
+        model = folder / f"model{number}"
+        yield tool, "train", [*train, "--detect", "--name", "image", "--out", model], environment
+        words = [*start, "photometry", image, "--detect"]
+        words += ["--model", model / "image.psf.safetensors", "--out", folder / f"{number}.csv"]
+        yield tool, "photometry", words, environment
+
+
+def list_peer_runs(image, folder):
+    """Yield tool, step, words and environment of the commands of the other programs."""
     for name, text in PEERS.items():
         if name != "piff" or find_spec("piff"):
             yield name, "train", [sys.executable, "-c", SOURCES + text, image], {}
@@ -164,43 +234,21 @@ def list_runs(image, trees, folder):
 
 
 def measure_process(words, folder, environment):
-    """Return CPU seconds and peak memory in MB of a command; a failure ends with its message."""
-    log = folder / "log"
+    """Return CPU seconds and peak memory in MB of a command and the processes that it starts.
+
+    A failure ends with its message. Of several processes the memory is that of the largest.
+    """
+    used, log = folder / "used", folder / "log"
     with log.open("w") as output:
-        child = subprocess.Popen(
-            [*map(str, words)], cwd=folder, env={**os.environ, **THREADS, **environment},
+        run = subprocess.run(
+            [sys.executable, "-I", "-S", "-c", MEASURE, used, *map(str, words)],
+            cwd=folder, env={**os.environ, **THREADS, **environment}, check=False,
             stdout=output, stderr=subprocess.STDOUT,
         )  # fmt: skip
-        # The peak that the system keeps may be that of this process, from which it was forked.
-        peak_kb = 0
-        while (ended := os.wait4(child.pid, os.WNOHANG))[0] == 0:
-            peak_kb = max(peak_kb, read_peak(child.pid))
-            time.sleep(EVERY_S)
-    child.returncode = os.waitstatus_to_exitcode(ended[1])
-    if child.returncode:
+    if run.returncode:
         raise click.ClickException(f"{' '.join(map(str, words))}: {log.read_text()[-2000:]}")
-    return {"cpu_s": round(ended[2].ru_utime + ended[2].ru_stime, 1), "peak_mb": peak_kb // 1024}
-
-
-def read_peak(process: int) -> int:
-    """Return the largest peak of the memory of a process and its children, in kB."""
-    peaks = [0]
-    for number in [process, *list_children(process)]:
-        try:
-            text = Path(f"/proc/{number}/status").read_text()
-        except OSError:  # it has ended
-            continue
-        peaks += [int(line.split()[1]) for line in text.splitlines() if line.startswith("VmHWM:")]
-    return max(peaks)
-
-
-def list_children(process: int) -> list[int]:
-    """Return the numbers of the processes that a process started."""
-    try:
-        words = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    except OSError:
-        return []
-    return [int(word) for word in words]
+    cpu_s, peak_b = map(float, used.read_text().split())
+    return {"cpu_s": round(cpu_s, 2), "peak_mb": round(peak_b / 1e6)}
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from psfdae_paper.stars.fields import assign_fields, perturb, relative_field
 from psfdae_paper.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 
 REQUIRED_SHARE = 0.6  # of the bare network's throughput, which a prediction must reach
-ALLOWED_MB = 1000.0  # memory that it may take
+ALLOWED_MB = 1000.0  # memory in MiB that it may take
 ALLOWED_RATIO = 0.1  # relative difference of the MSE from that of the workflow's own stars
 REPEATS = 3  # timings at most; each takes as long as three predictions
 WARM_UP = 4  # blocks of stars that are computed before the clock starts
@@ -98,7 +98,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     Those of the mixture are from one run.
 
     The bare network runs in one forward pass at a time on all threads ("shared"), and in as
-    many passes as threads beside each other. Then the memory of the prediction in MB,
+    many passes as threads beside each other. Then the memory of the prediction in MiB,
     interpreter and libraries included.
     """
     from psfdae.api import load_model

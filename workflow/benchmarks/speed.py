@@ -111,7 +111,7 @@ def growth(
 
 
 def chain(config, count, side, folder):
-    """Simulate stars, then predict their PSFs, one row each."""
+    """Simulate stars, then predict their PSFs, one row each; memory and disk are in MiB."""
     threads, tree = config.benchmark.threads, config.model_dump()
     tree["framing"]["stamp_px"], tree["optics"]["threads"] = side, threads
     trees = [{**tree, "stars": {**tree["stars"], "count": n}} for n in (FIRST_RUN_STARS, count)]

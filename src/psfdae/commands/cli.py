@@ -10,6 +10,7 @@ wrong and exit code 2.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import types
@@ -220,14 +221,23 @@ class SettingsCommand(click.Command):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the command line; UsageError says what to type in place of a foreign option."""
+        """Read the command line; UsageError says what to type in place of a foreign option.
+
+        No option takes NaN or infinity, which click reads as numbers.
+        """
         try:
-            return super().parse_args(ctx, args)
+            words = super().parse_args(ctx, args)
         except click.NoSuchOption as error:
             advice = self.foreign_options.get(error.option_name)
             if advice is None:
                 raise
             raise click.UsageError(f"{error.option_name}: {advice}", ctx) from None
+        for option in self.params:
+            value = ctx.params.get(option.name or "")
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise click.BadParameter(f"{number} is not a finite number", ctx, option)
+        return words
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

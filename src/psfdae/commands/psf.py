@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from typing import Annotated
 
 import click
@@ -85,11 +86,11 @@ def psf(
 
 def _position(text: str) -> tuple[float, float]:
     """Return the pixel position (x, y) of an option --at X,Y."""
-    try:
+    with suppress(ValueError):
         x, y = map(float, text.split(","))
-        return x, y
-    except ValueError:
-        raise PredictionError(f"--at {text!r}: expected X,Y, such as 100,250.5") from None
+        if np.isfinite([x, y]).all():
+            return x, y
+    raise PredictionError(f"--at {text!r}: expected X,Y, such as 100,250.5")
 
 
 def _grid_shape(text: str) -> tuple[int, int]:

@@ -20,7 +20,7 @@ from psfdae.image.errors import ObservationError, silent
 from psfdae.image.fits_file import ImageFile, open_pixels
 from psfdae.image.layers import NoiseMap
 from psfdae.image.observation import Observation
-from psfdae.image.positions import find_repeated_rows
+from psfdae.image.positions import find_repeated_rows, is_on_image
 from psfdae.image.sky import Sky, sky_around, subtract_sky
 from psfdae.image.stamps import Stamps, StarFlag, central_pixel, cut_image, raise_flag
 from psfdae.image.trails import add_trails
@@ -185,11 +185,15 @@ class Image(Observation):
             # 2 σ above the sky is a source.
             hits = int(is_on_source(sky, column, row, 2.0).sum())
         if hits < 0.5 * known_count:
-            raise ObservationError(
-                self.catalogue,
-                f"{hits} of {known_count} positions are on a source of {self.path}, at least half "
-                "are expected: a list of another image, or with stars too faint for this one?",
-            )
+            problem = f"{hits} of {known_count} positions are on a source of {self.path}, at least "
+            count = np.count_nonzero(is_on_image(self.positions, self.shape))
+            if hits >= 0.5 * count > 0:  # those on the image are on its sources
+                problem += f"half are expected, and {known_count - count} are off the image: "
+                problem += f"{keyword('on_image', True)} leaves these out, such as of other chips"
+            else:
+                problem += "half are expected: a list of another image, or with stars too faint "
+                problem += "for this one?"
+            raise ObservationError(self.catalogue, problem)
 
     def chunks(self, rows: int) -> Iterator[Stamps]:
         """Yield the stars in their order, at most `rows` at a time."""

@@ -140,6 +140,7 @@ def search_sky(source: ImageInput, image: Image) -> Image:
         # The sample of the sky by which the camera was checked may have shown shared noise already.
         if sky.correlation > 1.0 and image.noise_correlation == 1.0:
             sky_notes.append(describe_shared_noise(source.path, sky.correlation))
+            image = replace(image, noise_correlation=sky.correlation)
         image = replace(image, remarks=(*image.remarks, *sky_notes))
         if image.noise_map is not None:
             image = scale_noise_map(image, image.noise_map, sky)

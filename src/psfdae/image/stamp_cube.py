@@ -40,9 +40,17 @@ class StampCube(Observation):
             return
         # At most 64 planes, spread over the cube.
         step = -(-self.count // 64)
+        parts = [slice(row, row + 1) for row in range(0, self.count, step)]
         with open_pixels(self.data, in_pieces=True) as pixels:
-            planes = [pixels[row : row + 1] for row in range(0, self.count, step)]
-        if has_common_stars(np.concatenate(planes), self.stamp_px):
+            planes = np.concatenate([pixels[part] for part in parts]).astype(float)
+        # What is masked, such as a hot pixel, is in all planes, but is no star.
+        if self.mask is not None:
+            with open_pixels(self.mask.data, in_pieces=True, dtype=np.float64) as mask:
+                is_shared = len(mask.shape) == 2
+                masks = [mask[:][None]] if is_shared else [mask[part] for part in parts]
+            is_masked = self.mask.is_bad(np.concatenate(masks))
+            planes[np.broadcast_to(is_masked, planes.shape)] = np.nan
+        if has_common_stars(planes, self.stamp_px):
             raise ObservationError(
                 self.path,
                 "a time series: its planes show the same stars, also away from the middle, where "

@@ -219,6 +219,11 @@ def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
 
     A method that finds fluxes takes what it does not know of a star's shape for flux where there is
     little noise. Tried are a floor of 0 and the noise nodes, until the MSE rises.
+
+    Raises
+    ------
+    FitError
+        If the model measures no star with any floor.
     """
     errors, method = model.bundle.errors, model.method
     if not method.finds_flux:
@@ -236,10 +241,19 @@ def fit_noise_floor(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
         for images, star in noisy:
             prediction = tried_model.predict(images)
             psf = prediction.psf / prediction.flux[:, None, None]
-            node_log_mse.append(np.log(np.nanmean(np.square(psf - stars.references[star]))))
+            squares = np.square(psf - stars.references[star])
+            # A floor with which no star has a flux is the worst one.
+            has_flux = np.isfinite(squares).any()
+            node_log_mse.append(np.log(np.nanmean(squares)) if has_flux else np.inf)
         log_mse.append(float(np.mean(node_log_mse)))
         if log_mse[-1] > min(log_mse):
             break
+    if not np.isfinite(min(log_mse)):
+        raise FitError(
+            f"none of {len(test_stars.images)} held-out stars can be measured at the noise nodes "
+            f"{', '.join(f'{node:.2g}' for node in errors.noise[: len(noisy)])}: the model has no "
+            "usable PSF; more training stars may help"
+        )
     return replace(errors, noise_floor=floors[int(np.argmin(log_mse))])
 
 

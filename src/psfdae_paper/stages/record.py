@@ -227,7 +227,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
 
     Times are in seconds, sizes in MB, but `peak_mb` in MiB, as Snakemake measures it. `wall_s` is
     the time during which jobs of `make reproduce` ran, `on_request_s` the time of each further
-    target.
+    target. `cpu_s` is None if the log of a job lacks its CPU time.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def provenance(results: Path, config: Config) -> dict[str, object]:
         **installation,
         "results_mb": round(_size_mb(results), 1),
         "tests_s": None if tests is None else round(float(tests.get("time", "nan")), 1),
-        "cpu_s": round(float(costs.cpu_s.sum()), 1),
+        "cpu_s": None if costs.cpu_s.isna().any() else round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
 

@@ -93,7 +93,8 @@ def track(
     """
     # Methods, networks of scene 3, images of a night and sweeps; a sweep or experiment before its
     # points.
-    runs = tracking.read_dataset_runs(results, dict(stars))
+    target = f"experiment --config name={experiment}" if experiment else ""
+    runs = tracking.read_dataset_runs(results, dict(stars), target)
     runs = tracking.join_experiment(results, experiment, runs) if experiment else runs
     runs += tracking.read_alignment_runs(results) if alignment else []
     runs += tracking.read_night_runs(results) if night else []

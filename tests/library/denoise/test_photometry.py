@@ -20,7 +20,9 @@ from psfdae.denoise.star_flux import Photometer
 from psfdae.image.sky import border_pixels
 from psfdae.image.stamps import StarFlag, cut, displacement, smooth_stamps
 from psfdae.psf.wings import Wings
+from psfdae.stars import moments
 from psfdae.stars.moments import measure_shapes
+from psfdae_paper.stars.example import FieldRecipe, star_images
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
 
@@ -373,6 +375,21 @@ def test_width_and_axes_of_a_gaussian_with_its_pixel(sigma, ratio, degrees):
     assert shapes.ellipticity == pytest.approx(1 - minor / major, abs=0.02 if ratio == 1 else 0.01)
     off = (shapes.position_angle_deg - degrees + 90) % 180 - 90
     assert ratio == 1 or np.abs(off).max() < 0.5
+
+
+@pytest.mark.parametrize("defocus", [0.0, 0.8, 1.5])
+def test_the_shape_of_an_aberrated_star_is_where_its_weight_rests(defocus):
+    """A thousand plain updates move it less than 2e-4 of the width, also of the ring of a star."""
+    recipe = replace(FieldRecipe(), defocus_waves=defocus, seeing_px=1.2)
+    psf = star_images(recipe, np.random.default_rng(2).uniform(0, 1500, (40, 2)))
+    shapes, update = measure_shapes(psf), moments._update_gaussian
+    gaussian = np.array([np.zeros(40), np.zeros(40), *moments._adaptive_moments(psf)])
+    row, column = (axis.ravel() - 15.5 for axis in np.indices((32, 32)))
+    terms = np.stack([np.ones(1024), column, row, column**2, column * row, row**2])
+    for _ in range(1000):
+        gaussian = update(gaussian, psf.reshape(40, -1), terms.astype(np.float32), 32)
+    xx, xy, yy = gaussian[2:]
+    assert shapes.fwhm_px == pytest.approx(2.35482 * (xx * yy - xy**2) ** 0.25, rel=2e-4)
 
 
 def test_shapes_of_nothing_are_nan_and_of_anything_finite():

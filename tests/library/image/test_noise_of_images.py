@@ -11,6 +11,7 @@ from scipy import ndimage
 
 import psfdae
 from image_training import few_draws
+from psfdae.image import opening
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.sky import subtract_sky
@@ -263,6 +264,21 @@ def test_each_property_is_said_once(image, kind, map_kind, is_detected):
     kinds = [re.sub(r"[-+\d.,]+", "#", remark)[:60] for remark in observation.remarks]
     assert len(set(kinds)) == len(kinds)
     assert sum("pixels share their noise" in k for k in kinds) == (kind != "none")
+
+
+@pytest.mark.parametrize("kind", ["none", "two by two pixels"])
+def test_predictions_include_shared_noise_that_the_sky_alone_shows(monkeypatch, image, kind):
+    """The sample by which a camera is checked is small, and may show none."""
+    monkeypatch.setattr(opening, "check_camera", lambda _, camera: (dict(camera), [], 1.0))
+    axis, rng = np.arange(16.0, len(image) - 16, 20), np.random.default_rng(3)
+    place = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    light = drawn(moffat(2.8), place, np.full(len(place), 2e4), 300)
+    pixels = SKY + light + 14 * SHARED[kind](rng.normal(size=image.shape), rng)
+    observation = open_observation(ImageInput(pixels, detect=True, **SCALE), 16)
+    correlation = next(observation.chunks(9)).noise_correlation
+    is_said = any("errors include it" in remark for remark in observation.remarks)
+    assert is_said == (kind != "none") == bool(correlation.min() > 1.5)
+    assert correlation == pytest.approx(observation.sky().correlation)
 
 
 def test_faint_sources_are_not_noise_that_pixels_share():

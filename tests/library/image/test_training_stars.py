@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -209,6 +211,35 @@ def test_pixels_without_a_value_are_no_common_star(sky, value):
     assert not has_common_stars(stamps, 16)
     stamps[1:] += drawn(moffat(2.8), np.array([[12.0, 40.0]]), [5e4], 64)
     assert has_common_stars(stamps, 16)
+
+
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_masked_pixels_are_no_common_star(is_shared):
+    """A hot spot of the camera, which all planes have, in a mask for all or one for each."""
+    rng, middle = np.random.default_rng(6), np.full((1, 2), 32.0)
+    stamps = np.array([noisy(drawn(moffat(2.8), middle, [5e4], 64), rng) for _ in range(12)])
+    stamps += drawn(moffat(2.8), np.array([[12.0, 40.0]]), [5e4], 64)
+    mask = np.zeros(stamps.shape[is_shared:], np.uint8)
+    mask[..., 34:47, 6:19] = 1
+    open_observation(ImageInput(stamps, mask=mask, **CAMERA), 16, 8).check_planes()
+    with pytest.raises(ObservationError, match="time series"):
+        open_observation(ImageInput(stamps, mask=0 * mask, **CAMERA), 16, 8).check_planes()
+
+
+@pytest.mark.parametrize("chips", [1, 4])
+def test_a_list_of_other_chips_too_is_told_from_one_of_another_image(chips):
+    """Half of its stars may be off the image; more need an option, which the message names."""
+    place, rng = jittered(40), np.random.default_rng(7)
+    image = noisy(drawn(moffat(2.8), place, np.geomspace(2e4, 3e5, 40), SIZE), rng)
+    catalogue = np.concatenate([np.add(place, [SIZE * chip, 0]) for chip in range(chips)])
+    source = ImageInput(image, catalogue=catalogue, **CAMERA)
+    if chips > 1:
+        with pytest.raises(ObservationError, match="120 are off the image: on_image=True leaves"):
+            open_observation(source, 16).check_list()
+    open_observation(replace(source, on_image=True), 16).check_list()
+    shifted = replace(source, image=np.roll(image, 23, axis=(0, 1)), on_image=True)
+    with pytest.raises(ObservationError, match="a list of another image, or"):
+        open_observation(shifted, 16).check_list()
 
 
 # Colours.

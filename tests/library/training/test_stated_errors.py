@@ -11,19 +11,53 @@ from astropy.table import Table
 
 import psfdae
 from command_line import printed
-from psfdae.denoise.error_model import ModelErrors
+from psfdae.denoise.error_model import ErrorModel, ModelErrors
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.stamps import StarFlag
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.errors import excess_scatter
+from psfdae.methods.interface import FitError
 from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
-from psfdae.training.calibration import fit_model_errors
+from psfdae.stars.noise import NoiseModel
+from psfdae.training.calibration import fit_model_errors, fit_noise_floor
 from psfdae.training.fitting import describe_settings, fit_method
 from psfdae.training.packing import add_wings, build_uncalibrated
+from psfdae.training.star_sets import HeldOutStars
 from small_field import GAIN, READ, SKY, noisy
 
 SIZE = 600
+
+
+class BlindModel:
+    """A model that measures no star with a noise floor below `least_floor`."""
+
+    method = SimpleNamespace(finds_flux=True)
+
+    def __init__(self, errors, least_floor):
+        self.bundle, self.least_floor = SimpleNamespace(errors=errors), least_floor
+
+    def replace_errors(self, errors):
+        return BlindModel(errors, self.least_floor)
+
+    def predict(self, images):
+        is_seen = self.bundle.errors.noise_floor >= self.least_floor
+        flux = np.full(len(images), 1.0 if is_seen else np.nan)
+        return SimpleNamespace(psf=images * flux[:, None, None], flux=flux)
+
+
+@pytest.mark.parametrize("least_floor", [0.0, 2e-3, np.inf])
+def test_a_noise_floor_with_which_no_star_is_measured_is_not_chosen(least_floor):
+    """Where none is right, the fit ends with an error, not with a floor."""
+    nodes, star = np.array([1e-3, 2e-3, 4e-3, 8e-3]), np.full((1, 16, 16), 1 / 256)
+    model = BlindModel(ErrorModel.build_uncalibrated(nodes, np.ones((4, 16, 16))), least_floor)
+    unknown = np.zeros((1, 2)), np.zeros(1), np.zeros_like(star)
+    stars = HeldOutStars(star, star, NoiseModel(1.0, 1e9), *unknown)
+    if np.isfinite(least_floor):
+        assert fit_noise_floor(model, stars, 1).noise_floor == least_floor
+    else:
+        with pytest.raises(FitError, match=r"none of 1 held-out stars .* 0.001, 0.002"):
+            fit_noise_floor(model, stars, 1)
 
 
 def moffat(side, x, y, ux, uy):

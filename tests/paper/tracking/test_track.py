@@ -18,7 +18,7 @@ import pytest
 import yaml
 from mlflow.exceptions import MlflowException
 
-from psfdae.base.files import Column, write_product, write_text
+from psfdae.base.files import Column, ProductError, write_product, write_text
 from psfdae.methods import method
 from psfdae_paper import registry, tracking
 from psfdae_paper.configuration.estimators import Estimator, list_trained_networks
@@ -283,6 +283,18 @@ def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     assert attempt.content_hash != content_hash
     write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
     assert read_dataset_runs(tmp_path, stars)[2].config_hash != first.config_hash
+
+
+@pytest.mark.parametrize(
+    ("experiment", "target"),
+    [("", "snakemake dataset3"), ("mine", "snakemake experiment --config name=mine")],
+)
+def test_a_run_without_evaluations_names_a_target_that_there_is(tmp_path, experiment, target):
+    """A variant of a dataset, as of an experiment, is no target."""
+    stars = (("dataset3", tmp_path / "stars.h5"),)
+    options = {"stars": stars, "experiment": experiment}
+    with pytest.raises(ProductError, match=f"no evaluations; run `{target}` first"):
+        track.track(tmp_path, "fast", tmp_path / "m.db", tmp_path / "runs.csv", **options)
 
 
 def test_scene_3_and_a_night_are_read_from_their_tables(tmp_path):
