@@ -1,4 +1,4 @@
-"""PSFs of faint copies by another package, learnt from the training stars of the same list.
+"""PSFs of faint copies by another package, fitted to the training stars of the same list.
 
 usage: peers.py PACKAGE SAMPLING ORDER IMAGE SELECTION FAINT.npz OUT.npz
 

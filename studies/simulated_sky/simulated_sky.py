@@ -1,6 +1,6 @@
 """The PSF where a star stands, by psfdae and by other packages, on simulated images of scene 1.
 
-`field` simulates an image whose PSFs are known. Any package that has learnt from the training
+`field` simulates an image whose PSFs are known. Any package that was fitted to the training
 stars of psfdae's list says its PSF at the places of the stars that were held out; `places` fits
 centre, flux and sky of these stars in one way for all, and measures the errors.
 """
@@ -108,7 +108,7 @@ def places(
     packages: Annotated[
         tuple[str, ...],
         {"flag": "--other"},
-        "NAME=FILE of a package that learnt from the same stars: a .psf of PSFEx, or NPZ with psf "
+        "NAME=FILE of a package fitted to the same stars: a .psf of PSFEx, or NPZ with psf "
         "(held-out stars, m, m), PSFs at the listed places about the pixel m//2, and oversampling.",
     ] = (),
 ) -> None:

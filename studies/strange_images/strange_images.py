@@ -48,7 +48,7 @@ class Case:
     star_list : Table or None
         With which the commands run; None: `--detect`.
     reach_px : float
-        Farther from every true star than this, a source that is learnt from is no star.
+        Farther from every true star than this, a source that is trained on is no star.
     suffix : str
         Of the file.
     """

@@ -91,7 +91,7 @@ def test_the_lines_of_the_pages_run(training, tmp_path, monkeypatch):
     assert "<img" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-def test_held_out_stars_are_not_learnt_from(training, stars):
+def test_held_out_stars_are_not_trained_on(training, stars):
     learnt = np.unique(stars.product["field_index"][: SIZES["train_stars"]])
     assert not stars.held_out[learnt].any()
     assert training.model.info.training_stars == (~stars.held_out).sum()
@@ -106,7 +106,7 @@ def test_errors_of_held_out_stars_are_as_large_as_said(training):
     for name in ("flux", "centre", "psf"):
         off, doubt = table[f"{name}_within"] - COVERAGE, 3 * table[f"{name}_within_stderr"]
         assert (off > -doubt - 0.04).all(), name
-        # Errors of centres are too large at S/N 50 where 38 stars are learnt from: 84 % are within.
+        # Errors of centres are too large at S/N 50 where 38 stars are trained on: 84 % are within.
         assert (off < doubt + (0.16 if name == "centre" else 0.04)).all(), name
 
 

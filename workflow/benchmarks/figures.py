@@ -267,7 +267,7 @@ def image_growth(table):
     panels, sizes = figure.subplots(2, 2, sharex="col", sharey="row"), ("stars", "pixels")
     for column, against, other in zip(panels.T, sizes, sizes[::-1], strict=True):
         same = table[other] == table.groupby(other)[against].nunique().idxmax()
-        steps = table[same].sort_values(against).groupby("step", sort=False)
+        steps = table[same].sort_values(against, kind="stable").groupby("step", sort=False)
         for (step, rows), color in zip(steps, SERIES_COLORS, strict=False):
             for axes, cost in zip(column, ("cpu_s", "peak_mb"), strict=True):
                 # Slope between the two largest sizes, where constant terms count least.

@@ -21,7 +21,7 @@ rule train:
     shell:
         "psfdae paper fit {params.method} --config {params.config} --stars {input.stars}"
         " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"
-        " --out {params.place} > {log} 2>&1"
+        " --out {params.path} > {log} 2>&1"
 
 
 use rule train as baseline with:
@@ -190,4 +190,4 @@ for _rule, _name in fits.list_new_rules(rule.name for rule in workflow.rules).it
         shell:
             "psfdae paper fit {params.method} --config {params.config} --stars {input.stars}"
             " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"
-            " --out {params.place} > {log} 2>&1"
+            " --out {params.path} > {log} 2>&1"

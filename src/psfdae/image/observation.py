@@ -228,7 +228,7 @@ class Observation(ABC):
         if (no_position := self.lacks_position()).any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(no_position)])
             lines.append(
-                f"{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
+                f"{self.catalogue}: no position in row {rows}: flagged, and not trained on"
             )
         return "\n".join(lines)
 

@@ -316,7 +316,7 @@ def add_stars(source: ImageInput, image: ImageOrCube) -> ImageOrCube:
         subject = "row is" if len(rows) == 1 else "rows are"
         remarks.append(
             f"{image.catalogue}: {len(rows)} {subject} within {SAME_STAR_PX:g} px of an earlier "
-            f"one ({shorten(rows)}): flagged BLENDED, and not learnt from"
+            f"one ({shorten(rows)}): flagged BLENDED, and not trained on"
         )
     image = replace(image, remarks=(*image.remarks, *remarks))
     # A list may cover a larger part of the sky than the image; rows keep their numbers.

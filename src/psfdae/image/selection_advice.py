@@ -37,7 +37,7 @@ def saturation_advice(candidates: Candidates) -> str:
     stamp_count = np.count_nonzero(candidates.highest >= limit)
     return (
         f"saturation: the brightest pixels of {star_count} stars agree from {limit:.6g} counts on, "
-        f"as if cut off; {stamp_count} stamps have such pixels and are not learnt from, "
+        f"as if cut off; {stamp_count} stamps have such pixels and are not trained on, "
         f"{keyword('saturate', limit)} flags these, too"
     )
 

@@ -49,29 +49,29 @@ def add_suffix(method: type[Method], text: str) -> str:
     return text if get_storage(method).files else f"{text}.h5"
 
 
-def own_files(method: type[Method], place: str | Path) -> list[Path]:
+def own_files(method: type[Method], path: str | Path) -> list[Path]:
     """Return the files of a fit that the method itself reads."""
-    return [Path(place, name) for name in get_storage(method).files] or [Path(place)]
+    return [Path(path, name) for name in get_storage(method).files] or [Path(path)]
 
 
-def path_beside(method: type[Method], place: str | Path, name: str) -> Path:
+def path_beside(method: type[Method], path: str | Path, name: str) -> Path:
     """Return the path of an additional file of a fit: in its folder, or next to its product."""
-    place = Path(place)
-    return place / name if get_storage(method).files else place.with_name(f"{place.stem}.{name}")
+    path = Path(path)
+    return path / name if get_storage(method).files else path.with_name(f"{path.stem}.{name}")
 
 
-def outputs(method: type[Method], place: str | Path) -> list[Path]:
+def outputs(method: type[Method], path: str | Path) -> list[Path]:
     """Return the paths of all files of a fit."""
     further_names = (TRAINED_ON, *get_storage(method).diagnostics)
-    return own_files(method, place) + [path_beside(method, place, name) for name in further_names]
+    return own_files(method, path) + [path_beside(method, path, name) for name in further_names]
 
 
-def store(fit: Method, place: Path, config: Mapping[str, Any], stars: Product) -> None:
+def store(fit: Method, path: Path, config: Mapping[str, Any], stars: Product) -> None:
     """Write all files of a fit to stars, with its resolved configuration."""
-    fit.save(place, config)
-    write_origin(place, stars)
+    fit.save(path, config)
+    write_origin(path, stars)
     for name in get_storage(type(fit)).diagnostics:
-        write_text(path_beside(type(fit), place, name), as_csv(fit.diagnostic_rows[name]))
+        write_text(path_beside(type(fit), path, name), as_csv(fit.diagnostic_rows[name]))
 
 
 def describe_fit(
@@ -96,7 +96,7 @@ def get_training_reference(method: type[Method], reference: str) -> str:
 
 
 def require_fit(
-    method: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
+    method: type[Method], path: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
     """Raise an error if a fit does not belong to test stars.
 
@@ -104,7 +104,7 @@ def require_fit(
     ----------
     method : type of Method
         Class of the method.
-    place : Path
+    path : Path
         Folder or file of the fit.
     stars : Product
         Stars of the test, a product "stars".
@@ -121,4 +121,4 @@ def require_fit(
         For the first setting that differs, with both values.
     """
     options = describe_fit(method, {}, split, reference)
-    require_training(place, method.read_config(place), stars, config, **options)
+    require_training(path, method.read_config(path), stars, config, **options)

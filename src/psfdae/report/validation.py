@@ -82,7 +82,7 @@ def validate(
 
 
 def _require_unseen(model: StarModel, stars: ImageStars) -> None:
-    """Refuse a model that may have learnt from the stars held out, and one of another camera.
+    """Refuse a model that may have been trained on the stars held out, and one of another camera.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _require_unseen(model: StarModel, stars: ImageStars) -> None:
             f"{path}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
             f"takes {info.stamp_px} px"
         )
-    # A model of another image has learnt from none of these stars. Hashes of several images are
+    # A model of another image was trained on none of these stars. Hashes of several images are
     # one text, joined by commas.
     hashes = (str(info.config["stars"].get(key)) for key in ("image_sha256", "trained_on"))
     if not {*", ".join(hashes).split(", ")} & {*product.config["image_sha256"].split(", ")}:

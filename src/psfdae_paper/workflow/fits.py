@@ -33,7 +33,7 @@ def list_stored_methods(run: Run, dataset: str) -> list[type[Method]]:
     return [m for m in map(method, method_names(run, dataset)) if m.storage]
 
 
-def fit_place(run: Run, name: str, dataset: str, split_name: str, reference: str) -> str:
+def locate_fit(run: Run, name: str, dataset: str, split_name: str, reference: str) -> str:
     """Return the path of a fit, a folder or a file."""
     return f"{run.results}/{fit_files.get_fit_path(method(name), dataset, split_name, reference)}"
 
@@ -41,13 +41,13 @@ def fit_place(run: Run, name: str, dataset: str, split_name: str, reference: str
 def fit_outputs(run: Run, name: str, *key: str) -> list[str]:
     """Return all files of a fit of a dataset, split and reference; by default with wildcards."""
     # With wildcards, these are the outputs of a rule; with a key, the inputs of a job.
-    path = fit_place(run, name, *(key or WILDCARDS))
+    path = locate_fit(run, name, *(key or WILDCARDS))
     return [str(file) for file in fit_files.outputs(method(name), path)]
 
 
 def fit_option(run: Run, name: str, *key: str) -> str:
     """Return the option that gives a command the fit of a dataset, split and reference."""
-    return f"--{name.replace('_', '-')}={fit_place(run, name, *key)}"
+    return f"--{name.replace('_', '-')}={locate_fit(run, name, *key)}"
 
 
 def list_fit_files(run: Run, *key: str) -> list[str]:
@@ -108,7 +108,7 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
         # `start_files` gives this input to fits to templates only.
         if input.get("start"):
             key = (wildcards.dataset, wildcards.split, "realisation")
-            words.append(f"--start={fit_place(run, name, *key)}")
+            words.append(f"--start={locate_fit(run, name, *key)}")
         return words
 
     return {
@@ -116,7 +116,7 @@ def fit_params(run: Run, name: str) -> dict[str, Any]:
         "source": hash_code("fit", method(name).__module__),
         "method": name,
         "more": options,
-        "place": fit_place(run, name, *WILDCARDS),
+        "path": locate_fit(run, name, *WILDCARDS),
         # Not an output: Snakemake would delete it with the outputs of a job that fails.
         "checkpoint": f"{run.results}/checkpoints/{name}/{stem}.pt",
     }
@@ -233,7 +233,7 @@ def histories(run: Run, dataset: str) -> dict[str, str]:
     trainings = [m for m in methods if HISTORY in fit_files.get_storage(m).diagnostics]
     labels = {}
     for m, *key in product(trainings, group.splits, group.references):
-        path = fit_place(run, m.name, dataset, *key)
+        path = locate_fit(run, m.name, dataset, *key)
         # The method's label distinguishes histories of several methods.
         words = [dataset, *key, *([m.look.label] if len(trainings) > 1 else [])]
         labels[str(fit_files.path_beside(m, path, HISTORY))] = ", ".join(words)

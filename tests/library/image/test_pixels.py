@@ -92,7 +92,7 @@ def test_a_saturated_star_has_no_cosmic_rays(clean):
     assert not bad_pixels.find_blank_areas(flat, np.zeros(flat.shape, bool), 3000.0)
 
 
-def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
+def test_no_cosmic_ray_is_trained_on_and_their_number_is_said(clean):
     image, place, _ = clean
     dirty, true = with_cosmics(image)
     clean_set = Stars.from_image(image, detect=True, **CAMERA)

@@ -313,7 +313,7 @@ def test_iraf_counts_from_1_and_photutils_from_0(image, place):
 # Rows.
 
 
-def test_of_two_rows_of_one_star_one_is_flagged_and_one_learnt_from(image, place):
+def test_of_two_rows_of_one_star_one_is_flagged_and_one_trained_on(image, place):
     twice = np.concatenate([place, place[5:8] + np.array([0.05, -0.05])])
     single_rows = Stars.from_image(image, catalogue=place, **CAMERA)
     stars = Stars.from_image(image, catalogue=twice, **CAMERA)
