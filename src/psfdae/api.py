@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 from pydantic import PositiveInt
 
 from psfdae.base.arguments import check_arguments
+from psfdae.base.types import CCDData, GriddedPSFModel, QTable
 from psfdae.denoise.image_prediction import predict_stars
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.star_model import StarModel
@@ -29,10 +30,6 @@ from psfdae.training.settings import Settings, apply_keywords, settings_model
 from psfdae.training.stars import ImageStars
 
 if TYPE_CHECKING:
-    from astropy.nddata import CCDData
-    from astropy.table import QTable
-    from photutils.psf import GriddedPSFModel
-
     from psfdae.image.catalogue import StarList
     from psfdae.image.containers import ImageLike
 

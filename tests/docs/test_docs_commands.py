@@ -53,24 +53,49 @@ DRY = {
 """Commands that take over 10 minutes, need a run that does, or would run this test: planned."""
 
 
-def test_every_command_is_one_that_there_is_and_a_test_reads_its_page():
-    """Its words are those of `psfdae`, of the Makefile, or of a program that a test runs."""
+def check_words(line, targets):
+    """A command is one of `psfdae`, of the Makefile, or of a program that a test runs."""
+    program, *words = line.split() if isinstance(line, str) else line.words
+    if program == "make":
+        assert {word for word in words if "=" not in word} <= targets, line
+    elif program == "psfdae":
+        command, context = main, click.Context(main)
+        while isinstance(command, click.Group) and words and words[0][0].isalpha():
+            command = command.get_command(context, words.pop(0))
+        assert command is not None, line
+        options = {name for option in command.params for name in option.opts} | {"-h", "--help"}
+        assert {w.partition("=")[0] for w in words if w[0] == "-"} <= options, line
+    else:
+        assert program in ("cat", "cp", "snakemake", *NOT_RUN), line
+
+
+@pytest.fixture(scope="module")
+def targets():
+    """Targets of the Makefile."""
+    return set(re.findall(r"^([\w-]+):", read("Makefile"), re.M))
+
+
+def test_every_command_is_one_that_there_is_and_a_test_reads_its_page(targets):
     for page, test in TESTED_ELSEWHERE.items():
         assert page.removesuffix(".md") in read(f"tests/{test}")
-    targets = set(re.findall(r"^([\w-]+):", read("Makefile"), re.M))
     for page in pages():
         for line in commands(read(page)):
-            program, *words = line.words
-            if program == "make":
-                assert {word for word in words if "=" not in word} <= targets, line.typed
-            elif program == "psfdae":
-                command, context = main, click.Context(main)
-                while isinstance(command, click.Group):
-                    command = command.get_command(context, words.pop(0))
-                options = {name for option in command.params for name in option.opts}
-                assert {w.partition("=")[0] for w in words if w[0] == "-"} <= options, line.typed
-            else:
-                assert program in ("cat", "cp", "snakemake", *NOT_RUN), line.typed
+            check_words(line, targets)
+
+
+def test_every_command_in_a_sentence_is_one_that_there_is(targets):
+    """In pages, docstrings and messages; the history of changes has commands of its time."""
+    texts = [*(ROOT / "src").glob("**/*.py"), *(ROOT / "docs").glob("*.py"), ROOT / "Makefile"]
+    texts += [*(ROOT / "config").glob("**/*.yaml"), *map(ROOT.joinpath, pages())]
+    lines = {
+        " ".join(line.split())
+        for path in texts
+        if path.name != "CHANGELOG.md"
+        for line in re.findall(r"`((?:psfdae|make) [a-z][^`<]*)`", path.read_text("utf-8"))
+    } - {"psfdae name"}  # how CONTRIBUTING.md names any command
+    assert len(lines) > 40
+    for line in lines:
+        check_words(line, targets)
 
 
 @pytest.fixture(scope="module")

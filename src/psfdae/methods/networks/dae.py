@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch.nn.grad import conv2d_weight
 
 from psfdae.base.rng import stream
 from psfdae.methods.interface import TrainingSet
-from psfdae.methods.networks.settings import image_scale
+from psfdae.methods.networks.settings import DaeSettings, Train, image_scale
 from psfdae.methods.networks.training import (
     Adam,
     DeadNetworkError,
@@ -28,9 +28,6 @@ from psfdae.methods.networks.training import (
     TrainingError,
 )
 from psfdae.methods.networks.weights import channels_last
-
-if TYPE_CHECKING:
-    from psfdae.methods.networks.settings import DaeSettings, Train
 
 
 class SingleChannelConv(nn.Conv2d):
