@@ -379,17 +379,17 @@ def test_width_and_axes_of_a_gaussian_with_its_pixel(sigma, ratio, degrees):
 
 @pytest.mark.parametrize("defocus", [0.0, 0.8, 1.5])
 def test_the_shape_of_an_aberrated_star_is_where_its_weight_rests(defocus):
-    """A thousand plain updates move it less than 2e-4 of the width, also of the ring of a star."""
+    """300 plain updates move it less than 3e-4 of the width, also of the ring of a star."""
     recipe = replace(FieldRecipe(), defocus_waves=defocus, seeing_px=1.2)
     psf = star_images(recipe, np.random.default_rng(2).uniform(0, 1500, (40, 2)))
     shapes, update = measure_shapes(psf), moments._update_gaussian
     gaussian = np.array([np.zeros(40), np.zeros(40), *moments._adaptive_moments(psf)])
     row, column = (axis.ravel() - 15.5 for axis in np.indices((32, 32)))
     terms = np.stack([np.ones(1024), column, row, column**2, column * row, row**2])
-    for _ in range(1000):
+    for _ in range(300):
         gaussian = update(gaussian, psf.reshape(40, -1), terms.astype(np.float32), 32)
     xx, xy, yy = gaussian[2:]
-    assert shapes.fwhm_px == pytest.approx(2.35482 * (xx * yy - xy**2) ** 0.25, rel=2e-4)
+    assert shapes.fwhm_px == pytest.approx(2.35482 * (xx * yy - xy**2) ** 0.25, rel=3e-4)
 
 
 def test_shapes_of_nothing_are_nan_and_of_anything_finite():
