@@ -91,12 +91,12 @@ def test_a_mistyped_name_in_python_is_answered_with_the_one_meant(folder):
 )
 def test_no_option_takes_a_number_that_is_not_finite(folder, monkeypatch, number, line, option):
     monkeypatch.chdir(folder)
-    before = sorted(folder.iterdir())
+    names = sorted(folder.iterdir())
     gap = "" if line.endswith(",") else " "
     run = psfdae(*f"{line}{gap}{number}".split())
     assert run.exit_code == 2
     assert option in run.stderr and number in run.stderr
-    assert sorted(folder.iterdir()) == before
+    assert sorted(folder.iterdir()) == names
 
 
 @pytest.mark.workflow

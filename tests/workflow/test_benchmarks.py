@@ -123,8 +123,8 @@ def test_growth_shows_the_slope_of_the_largest_images():
         for stars, pixels in sizes
         for step in ("train", "photometry")
     ]
-    others = [{**row, "tool": "psfex", "cpu_s": 1.0} for row in rows]
-    figure = figures.image_growth(pd.DataFrame([*rows, *others, {**rows[0], "cpu_s": None}]))
+    rows_of_psfex = [{**row, "tool": "psfex", "cpu_s": 1.0} for row in rows]
+    figure = figures.image_growth(pd.DataFrame([*rows, *rows_of_psfex, {**rows[0], "cpu_s": None}]))
     labels = [[line.get_label() for line in axes.lines] for axes in figure.axes]
     assert labels[0] == ["train, slope 1.00", "photometry, slope 1.00"]
     assert labels[1] == ["train, slope 0.00", "photometry, slope 0.00"]

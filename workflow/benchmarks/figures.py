@@ -265,9 +265,9 @@ def image_growth(table):
     table = table[table["tool"] == "psfdae"].dropna(subset=["stars", "cpu_s"])
     figure = new_figure(6.0, layout="constrained")
     panels, sizes = figure.subplots(2, 2, sharex="col", sharey="row"), ("stars", "pixels")
-    for column, against, other in zip(panels.T, sizes, sizes[::-1], strict=True):
-        same = table[other] == table.groupby(other)[against].nunique().idxmax()
-        steps = table[same].sort_values(against, kind="stable").groupby("step", sort=False)
+    for column, against, fixed_size in zip(panels.T, sizes, sizes[::-1], strict=True):
+        in_series = table[fixed_size] == table.groupby(fixed_size)[against].nunique().idxmax()
+        steps = table[in_series].sort_values(against, kind="stable").groupby("step", sort=False)
         for (step, rows), color in zip(steps, SERIES_COLORS, strict=False):
             for axes, cost in zip(column, ("cpu_s", "peak_mb"), strict=True):
                 # Slope between the two largest sizes, where constant terms count least.
@@ -275,7 +275,7 @@ def image_growth(table):
                 growth, increase = logs[-1] - logs[0]
                 label = f"{step}, slope {increase / growth:.2f}" if growth else step
                 axes.plot(rows[against], rows[cost], marker="o", color=color, label=label)
-        column[0].set_title(f"{table[other][same].iloc[0]:,.0f} {other}")
+        column[0].set_title(f"{table[fixed_size][in_series].iloc[0]:,.0f} {fixed_size}")
         column[1].set_xlabel(against)
     for axes in panels.flat:
         axes.set(**LOGS)

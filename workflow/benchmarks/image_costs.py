@@ -136,17 +136,17 @@ def compare_tools(image, against, fields, growth, results):
 
     rows, failures, commit = [], 0, against or BEFORE
     # Images for all tools, then those for psfdae at this commit.
-    shared, alone = [*fields, *image], [size for size in growth if size not in fields]
+    images, own_images = [*fields, *image], [size for size in growth if size not in fields]
     with TemporaryDirectory() as name:
         trees = {"psfdae": ROOT, f"psfdae {commit}": extract_commit(commit, Path(name, "earlier"))}
-        for number, source in enumerate(shared + alone):
+        for number, source in enumerate(images + own_images):
             # Images of different folders may have the same name.
             folder = Path(name, f"image{number}")
             folder.mkdir()
             path = write_image(source, folder)
             about = {"image": path.stem, "pixels": prod(fits.getdata(path).shape)}
             about["stars"] = None if isinstance(source, Path) else source[1]
-            if number < len(shared):
+            if number < len(images):
                 runs = chain(list_own_runs(path, trees, folder), list_peer_runs(path, folder))
             else:
                 runs = list_own_runs(path, {"psfdae": ROOT}, folder)

@@ -332,9 +332,11 @@ def _update_gaussian(
     np.exp(weighted_light, out=weighted_light)
     weighted_light *= light
     x1, y1, apparent = _centre_and_moments(weighted_light @ terms.T)
-    matched = _bound_moments(*_correct_moments(apparent, weight), side)
-    centre = _correct_centre(x, y, x1, y1, apparent, matched)
-    return np.stack([*(np.clip(v, -0.5 * side, 0.5 * side) for v in centre), *matched])
+    moments_without_weight = _bound_moments(*_correct_moments(apparent, weight), side)
+    centre = _correct_centre(x, y, x1, y1, apparent, moments_without_weight)
+    return np.stack(
+        [*(np.clip(v, -0.5 * side, 0.5 * side) for v in centre), *moments_without_weight]
+    )
 
 
 Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]

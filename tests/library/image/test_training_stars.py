@@ -237,9 +237,9 @@ def test_a_list_of_other_chips_too_is_told_from_one_of_another_image(chips):
         with pytest.raises(ObservationError, match="120 are off the image: on_image=True leaves"):
             open_observation(source, 16).check_list()
     open_observation(replace(source, on_image=True), 16).check_list()
-    shifted = replace(source, image=np.roll(image, 23, axis=(0, 1)), on_image=True)
+    other_image = replace(source, image=np.roll(image, 23, axis=(0, 1)), on_image=True)
     with pytest.raises(ObservationError, match="a list of another image, or"):
-        open_observation(shifted, 16).check_list()
+        open_observation(other_image, 16).check_list()
 
 
 # Colours.
