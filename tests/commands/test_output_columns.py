@@ -22,8 +22,6 @@ from image_training import few_draws
 from known_wavefronts import SKY, field_of, imaged, sensed, three_terms
 from psfdae import StarFlag, load_model
 from psfdae.base.files import write_csv
-from psfdae.sensing import sampling
-from psfdae.sensing.sampling import Chains
 from psfdae.stars.moments import measure_shapes
 from psfdae.telescope.field import build_terms
 from psfdae.telescope.settings import Prior
@@ -504,9 +502,8 @@ def slopes(function, at, step=1e-4):
     )
 
 
-def test_columns_of_wavefront(monkeypatch):
+def test_columns_of_wavefront():
     """Coefficients, places, fluxes; errors by the Fisher matrix; odds of twins by the prior."""
-    monkeypatch.setattr(sampling, "CHAINS", Chains(steps=600))
     telescope, rng = three_terms(), np.random.default_rng(4)
     telescope = telescope.model_copy(update={"prior": Prior(waves=0.2)})
     angle = field_of(telescope, 12, rng)

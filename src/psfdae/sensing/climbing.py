@@ -41,6 +41,9 @@ class Steps(NamedTuple):
     max_drop: float = np.inf
     """Largest distance in ln of the posterior below the best climb of a group. A climb is abandoned
     if it stays farther below even after twice its predicted gain."""
+    min_distance: float = 0.0
+    """Distance in standard deviations from a higher climb of its group below which a climb joins
+    it: it ends with height −∞."""
 
 
 @dataclass
@@ -230,6 +233,9 @@ def climb(
         if group is not None:
             lowest = group_maximum(peaks.height, group) - steps.max_drop
             goes_on &= peaks.height + 2.0 * gain > lowest
+            if steps.min_distance:
+                is_joining = _find_joining(peaks, group, goes_on, steps.min_distance)
+                peaks.height[is_joining], goes_on = -np.inf, goes_on & ~is_joining
         active = np.flatnonzero(goes_on)
         if not active.size:
             break
@@ -247,6 +253,22 @@ def climb(
         larger_damping = np.maximum(10.0 * damping[active], 0.3)
         damping[active] = np.where(is_improved, damping[active] / 10.0, larger_damping)
     return peaks
+
+
+def _find_joining(
+    peaks: Peaks, group: np.ndarray, is_active: np.ndarray, min_distance: float
+) -> np.ndarray:
+    """Return True for active climbs that are near a higher one, active or at its end; all (M,)."""
+    # Pairs of a climb and a higher one of its group.
+    height, lower = peaks.height, np.flatnonzero(is_active)
+    is_pair = (group[lower, None] == group) & (height[lower, None] < height)
+    first, higher = np.nonzero(is_pair & (is_active | peaks.has_converged))
+    # Squared Mahalanobis distance gᵀ I g with the information of the higher one.
+    gap = peaks.parameters[lower[first]] - peaks.parameters[higher]
+    distance = np.einsum("nk,nkl,nl->n", gap, peaks.information[higher], gap)
+    is_joining = np.zeros(len(group), bool)
+    is_joining[lower[first[distance < min_distance**2]]] = True
+    return is_joining
 
 
 def _compute_damped_step(

@@ -10,7 +10,7 @@ the twin of every mode is a start, too, and both are returned with their probabi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
@@ -36,6 +36,12 @@ from psfdae.sensing.climbing import (
     poisson_information,
 )
 from psfdae.sensing.modes import merge_modes
+from psfdae.sensing.quadratic import (
+    QuadraticPosterior,
+    draw_design,
+    fit_root,
+    rotate_factor,
+)
 from psfdae.sensing.sampling import sample_around
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.telescope.field import Terms
@@ -262,6 +268,10 @@ class StarModes(Rows):
         """Best mode of each star."""
         return self.select(np.flatnonzero(np.diff(self.star, prepend=-1)))
 
+    def find_maxima(self) -> np.ndarray:
+        """Return the index of the best mode at the maximum of each mode, (M,)."""
+        return merge_modes(self.parameters, self.covariance, self.evidence, self.star)
+
     @property
     def probability(self) -> np.ndarray:
         """Fraction of the mass of the posterior of its star in each mode, (M,)."""
@@ -348,14 +358,17 @@ class WavefrontSearch:
             starts = [self._match_candidates(star, number, *sizes) for star in stars]
             members = np.repeat(stars, [len(start) for start in starts])
             fresh = self._climb(members, np.concatenate(starts))
-            # Climbs from the twins of the modes, where the prior permits them.
-            twins = fresh.parameters.copy()
-            twins[:, :count] = self.optics.twins(fresh.star, twins[:, :count])
+            # Climbs from the twins of new maxima, where the prior permits them.
+            all_modes = StarModes.join([*modes, fresh])
+            maximum, first = all_modes.find_maxima(), all_modes.star.size - fresh.star.size
+            new_modes = all_modes.select(np.setdiff1d(maximum[first:], maximum[:first]))
+            twins = new_modes.parameters.copy()
+            twins[:, :count] = self.optics.twins(new_modes.star, twins[:, :count])
             is_reachable = (np.abs(twins[:, :count]) <= MAX_Z).all(axis=1)
             if is_reachable.any():
-                twin_modes = self._climb(fresh.star[is_reachable], twins[is_reachable])
-                fresh = StarModes.join([fresh, twin_modes])
-            modes = [separate_modes(StarModes.join([*modes, fresh]))]
+                twin_modes = self._climb(new_modes.star[is_reachable], twins[is_reachable])
+                all_modes = StarModes.join([all_modes, twin_modes])
+            modes = [separate_modes(all_modes)]
             # The next round is for stars that are not explained, and for stars with an additional
             # mode of a probability above 1 %: there may be more.
             best_modes = modes[0].best_modes
@@ -400,23 +413,30 @@ class WavefrontSearch:
         The gain is the increase in log-likelihood over a model without star, with a free sky.
         """
         # Light of the star minus its mean, because the sky is free.
+        optics, side = self.optics, self.optics.stamp_px
         light = self.photons.counts[star] - self.photons.sky_counts[star]
         is_used = np.isfinite(light)
-        light = light[is_used] - light[is_used].mean()
-        # All windows of a stamp's size in the wide images of the candidates.
-        optics, side = self.optics, self.optics.stamp_px
+        light = np.where(is_used, light - light[is_used].mean(), 0.0)
+        # The star, and its used pixels, at each of the S places in a wide image, (2, S, wide²).
+        shifts, wide = 2 * optics.search_px + 1, side + 2 * optics.search_px
+        placed = np.zeros((2, shifts, shifts, wide, wide))
+        windows = np.lib.stride_tricks.sliding_window_view(
+            placed, (side, side), axis=(3, 4), writeable=True
+        )
+        windows = np.einsum("nijijab->nijab", windows)
+        windows[0], windows[1] = light.reshape(side, side), is_used.reshape(side, side)
+        star_at, used_at = placed.reshape(2, shifts**2, wide**2).swapaxes(1, 2)
         stars = np.full(len(z), star)
         coefficients = optics.coefficients(stars, z)
         modes = optics.mode_coefficients(stars, coefficients, np.zeros((len(z), 2)))
-        wide_stamps = self._wide_operator.stamps(modes).astype(np.float64)
-        windows = np.lib.stride_tricks.sliding_window_view(wide_stamps, (side, side), axis=(1, 2))
-        image = windows.reshape(-1, side**2)[:, is_used]
-        image -= image.mean(axis=1, keepdims=True)
-        # Least squares: flux = p·d/p·p, and χ² falls by flux p·d/σ², with σ² the sky's counts.
-        product = image @ light
-        flux = product / np.maximum((image**2).sum(axis=1), np.finfo(float).tiny)
+        images = self._wide_operator.stamps(modes).reshape(len(z), -1).astype(np.float64)
+        # Least squares: flux = p·d/p·p, and χ² falls by flux p·d/σ², with σ² the sky's counts. The
+        # image p of a candidate is without its mean over the n used pixels: Σ p² − (Σ p)²/n.
+        product, total = images @ star_at, images @ used_at
+        power = images**2 @ used_at - total**2 / is_used.sum()
+        flux = product / np.maximum(power, np.finfo(float).tiny)
         gain = np.where(flux > 0, flux * product, 0.0) / (2.0 * self.photons.sky_counts[star])
-        return flux.reshape(len(z), -1), gain.reshape(len(z), -1)
+        return flux, gain
 
     def _climb(self, star: np.ndarray, start: np.ndarray) -> StarModes:
         """Climb from starts (M, K + 4) of stars (M,) to modes."""
@@ -433,11 +453,12 @@ class WavefrontSearch:
             likelihood = poisson_information(photons.counts[stars], mean, slopes)
             return add_normal_prior(likelihood, parameters, self.prior_precision)
 
-        steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5)
+        steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5, min_distance=1.0)
         peaks = climb(evaluate, start, limit, steps, star)
         # Height = −½ (deviance + Σ x²/σ²).
         deviance = -2.0 * peaks.height - peaks.parameters**2 @ self.prior_precision
-        return StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
+        modes = StarModes(star, peaks.parameters, *peaks.laplace(), deviance)
+        return modes.select(np.isfinite(peaks.height))
 
     def _draw_block(self, modes: StarModes) -> np.ndarray:
         """Draw from the posteriors of all stars of the modes."""
@@ -451,25 +472,55 @@ class WavefrontSearch:
             gain = np.where((np.abs(twin_z) <= MAX_Z).all(axis=1), gain, -np.inf)
             return np.concatenate([twin_z, parameters[:, k:]], axis=1), gain
 
-        def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        def compute_stamps(star: np.ndarray, parameters: np.ndarray) -> np.ndarray:
             # Outside of the limits, the image at the limit is used.
-            star, place, reach = stars[member], parameters[:, k : k + 2], optics.reach_px
+            place = np.clip(parameters[:, k : k + 2], -optics.reach_px, optics.reach_px)
             coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
-            modes = optics.mode_coefficients(star, coefficients, np.clip(place, -reach, reach))
-            stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
+            modes = optics.mode_coefficients(star, coefficients, place)
+            return optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
+
+        def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+            star, stamps = stars[member], compute_stamps(stars[member], parameters)
             # Only the likelihood; derivatives are not needed.
             no_slopes = np.empty((len(star), 0, stamps.shape[1]))
             mean, no_slopes = self.predict_counts(star, stamps, no_slopes, parameters[:, k:])
             deviance = poisson_information(self.photons.counts[star], mean, no_slopes)[0]
             height = -0.5 * (deviance + parameters**2 @ self.prior_precision)
             # A star far from its stamp is impossible; a finite value keeps differences finite.
-            return np.where((np.abs(place) <= reach).all(axis=1), height, -1e100)
+            is_near = (np.abs(parameters[:, k : k + 2]) <= optics.reach_px).all(axis=1)
+            return np.where(is_near, height, -1e100)
+
+        def approximate(
+            numbers: np.ndarray, fit_places: Mapping[int, np.ndarray]
+        ) -> QuadraticPosterior:
+            # Images at the same places relative to all modes, and at the places that are given.
+            design = draw_design(k + 2, stream(self.seed, "wavefront design"))
+            roots = {}
+            for number in numbers:
+                place = design
+                if number in fit_places:
+                    place = np.concatenate([design, fit_places[number][:, : k + 2]])
+                star, shape = modes.star[number], factor[number, : k + 2, : k + 2]
+                at = modes.parameters[number, : k + 2] + place @ shape.T
+                roots[number] = fit_root(
+                    place,
+                    compute_stamps(np.full(len(at), star), at),
+                    self.photons.counts[star],
+                    self.flux[star],
+                    self.photons.sky_counts[star],
+                    modes.parameters[number, k + 2],
+                )
+            return QuadraticPosterior(modes.parameters, factor, self.prior_precision, roots)
 
         # A random stream for each star: its draws do not depend on other stars.
         owner = np.searchsorted(stars, modes.star)
         rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
-        mixture = modes.parameters, modes.covariance, modes.evidence
-        return sample_around(log_posterior, twin, owner, *mixture, rngs)
+        precision = self.prior_precision[: k + 2]
+        factor = np.array(
+            [rotate_factor(c, precision) for c in np.linalg.cholesky(modes.covariance)]
+        )
+        mixture = modes.parameters, factor, modes.evidence
+        return sample_around(log_posterior, twin, owner, *mixture, rngs, approximate)
 
     def predict_counts(
         self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, star_parameters: np.ndarray
@@ -506,6 +557,5 @@ def separate_modes(modes: StarModes) -> StarModes:
     is_likely = modes.evidence > group_maximum(modes.evidence, modes.star) - 12.0
     modes = modes.select(is_likely)
     # One mode for each maximum.
-    maximum = merge_modes(modes.parameters, modes.covariance, modes.evidence, modes.star)
-    modes = modes.select(np.unique(maximum))
+    modes = modes.select(np.unique(modes.find_maxima()))
     return modes.select(np.lexsort((-modes.evidence, modes.star)))

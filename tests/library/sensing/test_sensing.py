@@ -18,25 +18,19 @@ from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening, Profile
 from psfdae.optics.wavefronts import zernike_images
-from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, add_normal_prior, climb, poisson_information
 from psfdae.sensing.joint import TelescopePosterior, twin_numbers
 from psfdae.sensing.modes import compute_squared_distance, merge_modes
 from psfdae.sensing.plot import bright_separate_stars
+from psfdae.sensing.quadratic import QuadraticPosterior, draw_design, fit_root, rotate_factor
 from psfdae.sensing.results import build_stamps
-from psfdae.sensing.sampling import Chains, sample_around
+from psfdae.sensing.sampling import choose_evenly, sample_around
 from psfdae.sensing.stars import Photons, SensingError, StarOptics
 from psfdae.telescope.field import build_terms, model_telescope
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load
-
-
-@pytest.fixture
-def short_chains(monkeypatch):
-    """Half of the steps, with as many draws kept: quantiles scatter as they do otherwise."""
-    monkeypatch.setattr(sampling, "CHAINS", Chains(steps=600))
 
 
 @pytest.mark.parametrize(
@@ -167,7 +161,7 @@ def test_chains_draw_from_a_normal_whose_mode_is_known_badly():
     def twin(owner, at):
         return at, np.full(len(at), -np.inf)
 
-    modes = np.array([[2.5, 3.2]] * 20), np.array([0.64 * np.eye(2)] * 20), np.zeros(20)
+    modes = np.array([[2.5, 3.2]] * 20), np.array([0.8 * np.eye(2)] * 20), np.zeros(20)
     rngs = [np.random.default_rng(i) for i in range(20)]
     draws = sample_around(height, twin, np.arange(20), *modes, rngs).reshape(-1, 2)
     assert draws.mean(axis=0) == pytest.approx([3.0, 3.0], abs=0.1)
@@ -183,10 +177,89 @@ def test_twins_are_drawn_by_their_probability():
     def twin(owner, at):
         return -at, -at[:, 0]
 
-    modes = np.ones((8, 1)), np.full((8, 1, 1), 0.01), np.zeros(8)
+    modes = np.ones((8, 1)), np.full((8, 1, 1), 0.1), np.zeros(8)
     rngs = [np.random.default_rng(i) for i in range(8)]
     draws = sample_around(height, twin, np.arange(8), *modes, rngs)
     assert np.mean(draws > 0) == pytest.approx(np.e / (1 + np.e), abs=0.03)
+
+
+@pytest.mark.parametrize(("offset", "exact_per_star"), [(0.7, 300), (4.0, 9900)])
+def test_draws_are_of_the_posterior_whatever_the_approximation(offset, exact_per_star):
+    """An approximation off by 0.7 σ is corrected by weights; one off by 4 σ is not followed."""
+    evaluated = []
+
+    def height(owner, at):
+        evaluated.append(len(at))
+        return -0.5 * ((at - 1.0) ** 2).sum(axis=1)
+
+    def approximate(modes, places):
+        return lambda mode, place: -0.5 * ((place - [offset, 0.0]) ** 2).sum(axis=1) + 7.0
+
+    def twin(owner, at):
+        return at, np.full(len(at), -np.inf)
+
+    modes = np.ones((20, 2)), np.array([np.eye(2)] * 20), np.zeros(20)
+    rngs = [np.random.default_rng(i) for i in range(20)]
+    draws = sample_around(height, twin, np.arange(20), *modes, rngs, approximate).reshape(-1, 2)
+    assert draws.mean(axis=0) == pytest.approx([1.0, 1.0], abs=0.07)
+    assert np.cov(draws.T) == pytest.approx(np.eye(2), abs=0.12)
+    assert sum(evaluated) / 20 == pytest.approx(exact_per_star, rel=0.1)
+
+
+def test_shares_are_rounded_without_bias():
+    weight = np.array([0.31, 0.0, 0.69])
+    counts = [
+        np.bincount(choose_evenly(weight, np.random.default_rng(i), 10), minlength=3)
+        for i in range(400)
+    ]
+    assert np.mean(counts, axis=0) == pytest.approx([3.1, 0.0, 6.9], abs=0.06)
+    assert np.unique([count[0] for count in counts]).tolist() == [3, 4]
+
+
+def test_quadratic_images_give_the_posterior_of_counts_with_their_variance_at_the_mode():
+    """A pixel without counts does not matter."""
+    rng, sky, unit = np.random.default_rng(2), 50.0, 1000.0
+    linear, square = rng.normal(0.0, 0.01, (2, 3, 20))
+    mean = np.array([0.3, -0.2, 0.1, 1.1, 0.4])
+    factor = rotate_factor(np.tril(rng.uniform(0.2, 0.5, (5, 5))), np.full(3, 0.5))
+    precision = np.array([1.0, 1.0, 1.0, 0.0, 0.0])
+
+    def image(shape):
+        return 0.05 + shape @ linear + shape**2 @ square
+
+    counts = rng.poisson(1.1 * unit * np.abs(image(mean[:3])) + sky).astype(float)
+    counts[4] = np.nan
+    design = draw_design(5, rng)[:, :3]
+    images = image(mean[:3] + design @ factor[:3, :3].T)
+    root = fit_root(design, images, counts, unit, sky, mean[3])
+    posterior = QuadraticPosterior(mean[None], factor[None], precision, {0: root})
+    place = rng.standard_normal((40, 5))
+    at = mean + place @ factor.T
+    expected = unit * at[:, 3:4] * image(at[:, :3]) + sky + sky**0.5 * at[:, 4:]
+    variance = unit * mean[3] * image(mean[:3]) + sky
+    chi2 = np.nansum((counts - expected) ** 2 / variance, axis=1)
+    height = posterior(np.zeros(40, int), place)
+    assert height == pytest.approx(-0.5 * (chi2 + at**2 @ precision), rel=1e-4)
+
+
+def test_rotation_of_a_factor_keeps_the_covariance_and_sorts_by_what_the_image_knows():
+    factor = np.linalg.cholesky(np.diag([0.9, 0.01, 0.4, 2.0, 3.0]) + 0.01)
+    rotated = rotate_factor(factor, np.ones(3))
+    assert rotated @ rotated.T == pytest.approx(factor @ factor.T)
+    assert rotated[:3, 3:] == pytest.approx(0.0)
+    # The image knows the second parameter best: its posterior is the narrowest.
+    assert np.abs(rotated[:3, :3]).argmax(axis=0).tolist() == [1, 2, 0]
+
+
+def test_climbs_that_meet_are_one():
+    """Both sides of a maximum lead there; a second maximum, and another group, are kept."""
+    centre = np.array([[0.0], [0.0], [9.0], [0.0]])
+    starts, group = np.array([[-3.0], [2.0], [8.0], [1.0]]), np.array([0, 0, 0, 1])
+    evaluate = quadratic(centre, np.array([[1.0]]))
+    steps = Steps(initial_damping=0.5, min_distance=1.0, min_gain=1e-6)
+    peaks = climb(evaluate, starts, np.inf, steps, group)
+    assert np.isfinite(peaks.height).tolist() == [False, True, True, True]
+    assert peaks.parameters[1:, 0] == pytest.approx([0.0, 9.0, 0.0], abs=0.02)
 
 
 # --- Optics
@@ -260,7 +333,6 @@ def test_coarse_pupils_err_far_below_the_noise(kind, monkeypatch):
 # --- Single stars
 
 
-@pytest.mark.usefixtures("short_chains")
 def test_noise_free_stars_come_back():
     telescope, rng = three_terms(), np.random.default_rng(4)
     angle = field_of(telescope, 4, rng)
@@ -287,7 +359,6 @@ def test_noise_free_stars_come_back():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("short_chains")
 def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     telescope, rng = three_terms(), np.random.default_rng(5)
     angle = field_of(telescope, 20, rng)
@@ -310,7 +381,6 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     assert wavefronts.chi2.mean() == pytest.approx(0.97, abs=0.05)
 
 
-@pytest.mark.usefixtures("short_chains")
 def test_bad_stars_stop_nobody_and_are_kept_as_rows():
     telescope, rng = three_terms(), np.random.default_rng(8)
     angle = field_of(telescope, 6, rng)
@@ -395,7 +465,6 @@ def test_the_posterior_of_a_telescope_is_likelihood_times_normal_prior():
     assert information[:q, :q] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.usefixtures("short_chains")
 def test_seeing_is_found_with_the_telescope():
     """Worse by 20 % than the file says; its error goes with that of the aberrations."""
     telescope, rng = three_terms(), np.random.default_rng(4)
@@ -452,7 +521,6 @@ def test_slopes_of_the_field_s_numbers_are_differences():
 # --- The command
 
 
-@pytest.mark.usefixtures("short_chains")
 def test_command_finds_the_changed_coma(tmp_path):
     """The coma of an image is not that of the telescope's file."""
     words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
@@ -477,7 +545,6 @@ def test_command_finds_the_changed_coma(tmp_path):
     assert "9 stars, 0 not explained" in output
 
 
-@pytest.mark.usefixtures("short_chains")
 def test_python_lines_of_the_page_run(monkeypatch, capsys):
     telescope, rng = example("zernike"), np.random.default_rng(10)
     angle = field_of(telescope, 7, rng)
