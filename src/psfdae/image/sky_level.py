@@ -2,9 +2,10 @@
 
 Inputs: an image (h, w) and its bad pixels. Output: `SkyLevel`, a level and a σ for each pixel.
 
-photutils measures both in meshes and interpolates between them. Amplifiers of different bias make
-steps, which are found first: each part of the image has meshes of its own. A nebula, or the halo of
-a bright star, changes within a mesh; there the level is a median of the surrounding pixels.
+Both are measured in meshes (Bertin & Arnouts 1996, A&AS 117, 393), and interpolated between them.
+Amplifiers of different bias make steps, which are found first: each part of the image has meshes of
+its own. A nebula, or the halo of a bright star, changes within a mesh; there the level is a median
+of the surrounding pixels.
 """
 
 from __future__ import annotations
@@ -84,6 +85,16 @@ def sky_level(
     ValueError
         If no mesh has enough good pixels.
     """
+    return add_shared_noise(image, bad, measure_sky(image, bad, structure, mesh_px))
+
+
+def measure_sky(
+    image: np.ndarray, bad: np.ndarray, structure: SkyStructure | None = None, mesh_px: int = 64
+) -> SkyLevel:
+    """Measure level and noise as `sky_level` does, but the noise of single pixels.
+
+    Its `correlation` is 1 until `add_shared_noise` has measured it.
+    """
     # Dither whole counts, so that medians are not rounded.
     step = structure.pixel_step if structure else count_step(np.where(bad, np.nan, image))
     image, dither_variance = dither(image, step)
@@ -102,13 +113,20 @@ def sky_level(
             "it is measured in 14 px there, and light of wide sources is lost in it"
         )
     noise = remove_dither(noise, dither_variance)
+    return SkyLevel(level, noise, structure._replace(is_fine=fraction > 0), 1.0, tuple(notes))
+
+
+def add_shared_noise(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> SkyLevel:
+    """Return the sky of an image (h, w) with the noise of sums of pixels, which may share noise."""
     # Errors refer to sums of pixels, whose noise is larger if neighbours are correlated.
+    middle = _cut_middle(image.shape)
     with np.errstate(all="ignore"):
-        correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
-    noise *= correlation
-    return SkyLevel(
-        level, noise, structure._replace(is_fine=fraction > 0), correlation, tuple(notes)
-    )
+        part, _ = dither(image[middle], sky.structure.pixel_step)
+        deviation = (part - sky.level[middle]) / sky.noise[middle]
+        correlation = noise_correlation(np.where(bad[middle], np.nan, deviation))
+    if correlation == 1.0:
+        return sky
+    return sky._replace(noise=np.float32(correlation) * sky.noise, correlation=correlation)
 
 
 def level_and_noise(
@@ -132,7 +150,7 @@ def level_and_noise(
     # Structure that is finer than the meshes: σ of a mesh over σ from differences of neighbouring
     # pixels is larger there than elsewhere by a factor of 1.5; in resampled images it is larger
     # everywhere. Both change slowly: every fourth pixel is enough.
-    pixel_sigma = pixel_noise(fill_bad(image, bad)[0], bad)
+    pixel_sigma = pixel_noise(image, bad)
     sample = np.s_[::4, ::4]
     ratio = noise[sample] / pixel_sigma[sample]
     ratio = ratio[~bad[sample] & (ratio > 0)]
@@ -167,22 +185,20 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
     """
-    # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
-    difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
-    hidden = bad | np.concatenate([bad[:, 1:], bad[:, -2:-1]], axis=1)
-    difference[hidden] = np.nan
-    height, width = image.shape
-    noise = np.full(image.shape, np.inf, difference.dtype)
-    for top in range(0, height, 64):
-        for first in range(0, width, 64):
-            square = np.s_[top : top + 64, first : first + 64]
-            values, count = difference[square].ravel(), np.count_nonzero(~hidden[square])
-            if not count:
-                continue
-            # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ; NaN comes last.
-            middle = [(count - 1) // 2, count // 2]
-            sigma = 1.4826 / np.sqrt(2.0) * float(np.partition(values, middle)[middle].mean())
-            noise[square] = sigma if sigma > 0 else np.inf
+    noise = np.full(image.shape, np.inf, np.float32)
+    for top in range(0, len(image), 64):
+        band, is_hidden = image[top : top + 64], bad[top : top + 64]
+        # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
+        difference = np.abs(np.diff(band, axis=1, append=band[:, -2:-1]))
+        is_hidden = is_hidden | np.concatenate([is_hidden[:, 1:], is_hidden[:, -2:-1]], axis=1)
+        # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ.
+        meshes = zip(*sort_meshes(difference, is_hidden, 64), strict=True)
+        medians = [
+            0.5 * (values[(count - 1) // 2] + values[count // 2]) if count else 0.0
+            for values, count in meshes
+        ]
+        sigma = 1.4826 / np.sqrt(2.0) * np.array(medians)
+        noise[top : top + 64] = np.repeat(np.where(sigma > 0, sigma, np.inf), 64)[: band.shape[1]]
     return noise
 
 
@@ -203,9 +219,8 @@ def noise_correlation(deviation: np.ndarray) -> float:
     deviation : ndarray, shape (h, w)
         Pixels without their sky, in σ; NaN where they are ignored. Sources are masked here.
     """
-    # The middle of a large image is enough.
-    middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
-    values = deviation[middle]
+    deviation = deviation[_cut_middle(deviation.shape)]
+    values = deviation
     if min(values.shape) < 16:
         return 1.0
     # Means of 3 × 3 pixels scatter by σ/3, or more if these are correlated: three times this.
@@ -227,10 +242,15 @@ def noise_correlation(deviation: np.ndarray) -> float:
     # √(1 + 2 Σ ρ a): each lag stands for itself and its opposite.
     lags = [(0, 1), (0, 2), *product((1, 2), range(-2, 3))]
     noise_correlations = np.array([_correlation(values, *lag) for lag in lags])
-    source_correlations = correlate_sources(deviation[middle], lags, noise_correlations)
+    source_correlations = correlate_sources(deviation, lags, noise_correlations)
     excess = float((noise_correlations - structure) @ source_correlations)
     excess /= max(1.0 - structure, 0.1)
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
+
+
+def _cut_middle(shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the middle 1024 rows and columns of an image, enough to measure shared noise."""
+    return tuple(slice(max(0, size // 2 - 512), size // 2 + 512) for size in shape)
 
 
 def correlate_sources(
@@ -277,6 +297,9 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
     height, width = values.shape
     a = values[: height - rows_apart, max(0, -columns_apart) : width - max(0, columns_apart)]
     b = values[rows_apart:, max(0, columns_apart) : width - max(0, -columns_apart)]
+    # Some of the rows, with 2¹⁸ pairs, show ρ to 0.005.
+    every = np.s_[:: a.size // 2**18 + 1]
+    a, b = a[every], b[every]
     is_finite = np.isfinite(a) & np.isfinite(b)
     if np.count_nonzero(is_finite) < 1000:
         return 0.0
@@ -305,10 +328,7 @@ def _measure_sky(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.n
     ValueError
         If every mesh has more than 80 % bad pixels.
     """
-    from photutils.background import Background2D
-
-    meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
-    level, sigma = meshes.background_mesh, meshes.background_rms_mesh
+    level, sigma = measure_meshes(image, bad, mesh_px)
     neighbours = _smooth_meshes(level)
     # A mesh differs from its neighbours by its error, about 2.5 σ/√N for the mode of N pixels, and
     # by the curvature of the sky: the larger the curvature, the larger its own weight (James &
@@ -321,6 +341,113 @@ def _measure_sky(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.n
     smooth = neighbours + np.where(has_stars, 0.0, mesh_weight * deviation)
     noise = _to_pixels(_smooth_meshes(sigma), image.shape, mesh_px, 0.0)
     return _to_pixels(smooth, image.shape, mesh_px, mesh_weight), noise
+
+
+def measure_meshes(
+    image: np.ndarray, bad: np.ndarray, mesh_px: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mode and σ of the pixels in meshes, (m, n) each, as photutils' `Background2D`.
+
+    Pixels over 3 σ from the median are left out, in up to ten turns. Meshes in which a fifth of
+    the pixels or less remain take the mean of the ten nearest others, weighted by 1/distance.
+    Sorted pixels and their running sums take an eighth of the time of `Background2D`, and the
+    memory of one row of meshes.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+        Finite pixels.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that are ignored.
+    mesh_px : int
+        Side of the meshes in px. Those at the lower and right edges may be smaller.
+
+    Raises
+    ------
+    ValueError
+        If every mesh has too few pixels.
+    """
+    from scipy.spatial import cKDTree
+
+    statistics = []
+    for top in range(0, len(image), mesh_px):
+        band = np.s_[top : top + mesh_px]
+        meshes = zip(*sort_meshes(image[band], bad[band], mesh_px), strict=True)
+        least = 0.2 * mesh_px**2
+        statistics.append([_clip_sorted(values[:count], least) for values, count in meshes])
+    level, noise = np.moveaxis(statistics, 2, 0)
+    # Meshes without a value, from their neighbours.
+    is_known = np.isfinite(level)
+    if not is_known.any():
+        raise ValueError(f"no mesh of {mesh_px} px has enough good pixels")
+    if not is_known.all():
+        nearest = min(10, np.count_nonzero(is_known))
+        tree = cKDTree(np.argwhere(is_known))
+        distance, index = tree.query(np.argwhere(~is_known), k=range(1, nearest + 1))
+        for values in (level, noise):
+            values[~is_known] = np.average(values[is_known][index], axis=1, weights=1.0 / distance)
+    return level, noise
+
+
+def _clip_sorted(values: np.ndarray, least: float) -> tuple[float, float]:
+    """Return mode and σ of ascending values (n,) within 3 σ of their median.
+
+    The mode is 2.5 median − 1.5 mean, or the median if this differs from the mean by 0.3 σ or more.
+    Both are NaN of `least` values or fewer.
+    """
+    if len(values) <= least:
+        return np.nan, np.nan
+    # Running sums of the deviations from the first median, and of their squares.
+    first_median = float(values[len(values) // 2])
+    deviation = values - values.dtype.type(first_median)
+    sums = np.zeros((2, len(values) + 1))
+    np.cumsum(deviation, dtype=np.float64, out=sums[0, 1:])
+    np.cumsum(np.square(deviation), dtype=np.float64, out=sums[1, 1:])
+    # The values from index `low` to before `high` are left, in up to ten turns.
+    low, high = 0, len(values)
+    for turn in range(11):
+        mean, mean_square = ((sums[:, high] - sums[:, low]) / (high - low)).tolist()
+        sigma = max(mean_square - mean**2, 0.0) ** 0.5
+        middle = low + high
+        median = 0.5 * (float(deviation[(middle - 1) // 2]) + float(deviation[middle // 2]))
+        limits = [median - 3.0 * sigma, median + 3.0 * sigma]
+        first = max(int(deviation.searchsorted(limits[0])), low)
+        end = min(int(deviation.searchsorted(limits[1], side="right")), high)
+        if turn == 10 or (first, end) == (low, high):
+            break
+        low, high = first, end
+    if high - low <= least:
+        return np.nan, np.nan
+    is_plausible = abs(mean - median) < 0.3 * sigma
+    return first_median + (2.5 * median - 1.5 * mean if is_plausible else median), sigma
+
+
+def sort_meshes(band: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of each mesh in a row of meshes, sorted, and the number of good ones.
+
+    Parameters
+    ----------
+    band : ndarray, shape (r, w)
+        The pixels, r at most `mesh_px`.
+    bad : ndarray of bool, shape (r, w)
+        Pixels that are ignored.
+    mesh_px : int
+        Side of the meshes.
+
+    Returns
+    -------
+    values : ndarray, shape (n, mesh_px²)
+        Good pixels, ascending, and NaN after them.
+    count : ndarray of int, shape (n,)
+        Number of good pixels.
+    """
+    # The band in whole meshes; NaN are last in the order.
+    rows, width = band.shape
+    padded = np.full((mesh_px, -(-width // mesh_px) * mesh_px), np.nan, band.dtype)
+    padded[:rows, :width] = np.where(bad, np.nan, band)
+    values = padded.reshape(mesh_px, -1, mesh_px).swapaxes(0, 1).reshape(-1, mesh_px**2)
+    values.sort(axis=1)
+    return values, np.count_nonzero(~np.isnan(values), axis=1)
 
 
 def _extrapolate(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
@@ -377,19 +504,23 @@ def _to_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     slope : float
         Part of the slope outside the outer meshes, as in `_extrapolate`.
     """
-    extended_mesh = _extrapolate(mesh, 2, slope)
-    # The spline is a product of splines along rows and columns, and linear in the meshes: a weight
-    # is the value at a pixel of the spline through 1 in one mesh and 0 in all others.
-    weights = []
-    for pixels, meshes in zip(shape, extended_mesh.shape, strict=True):
-        position = (np.arange(pixels) + 0.5) / mesh_px - 0.5 + 2.0
-        at = np.meshgrid(position, np.arange(meshes), indexing="ij")
-        weights.append(scipy.ndimage.map_coordinates(np.eye(meshes), at, order=3, mode="nearest"))
-    row_weights, columns = weights[0], extended_mesh @ weights[1].T
+    from scipy.interpolate import BSpline
+
+    # Coefficients of the spline through the meshes, which ends 14 meshes outside the image.
+    margin = 14
+    extended_mesh = np.pad(_extrapolate(mesh, 2, slope), margin - 2, mode="edge")
+    coefficients = scipy.ndimage.spline_filter(extended_mesh, mode="mirror")
+    # Weights of the coefficients along rows and columns: four at each pixel.
+    row_weights, column_weights = (
+        BSpline.design_matrix(
+            (np.arange(pixels) + 0.5) / mesh_px - 0.5 + margin, np.arange(-2.0, count + 2.0), 3
+        )
+        for pixels, count in zip(shape, coefficients.shape, strict=True)
+    )
     # A few rows at a time: products take twice the memory of the values.
-    values = np.empty(shape, np.float32)
-    for top in range(0, len(values), 256):
-        values[top : top + 256] = row_weights[top : top + 256] @ columns
+    rows, values = row_weights @ coefficients, np.empty(shape, np.float32)
+    for top in range(0, len(values), 64):
+        values[top : top + 64] = (column_weights @ rows[top : top + 64].T).T
     return values
 
 

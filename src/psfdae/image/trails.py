@@ -183,6 +183,8 @@ def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
     is the point farthest from the edge of the core, in whatever direction its charge bleeds; the
     radius is its distance from the edge.
     """
+    if not is_saturated.any():
+        return np.empty((0, 3))
     label, _ = scipy.ndimage.label(is_saturated, np.ones((3, 3)))
     boxes, area = scipy.ndimage.find_objects(label), np.bincount(label.ravel())[1:]
     largest = np.argsort(-area, kind="stable")[: min(50, np.count_nonzero(area >= 4))]

@@ -21,6 +21,7 @@ from psfdae.denoise.denoiser import MAX_CHI2
 from psfdae.denoise.flux_model import is_faint
 from psfdae.image.image import Image
 from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.image.trails import find_saturated_cores
 from psfdae.photometry.joint_fit import JointFit, chains, fit_stars, pairs_within
 from psfdae.photometry.matched_filter import find_stars
 from psfdae.photometry.photon_noise import pixel_error
@@ -150,7 +151,7 @@ def photometry(
     sky = observation.sky()
     image = sky.signal + sky.level
     is_saturated = image >= saturate
-    bad = sky.bad | is_saturated
+    bad, cores = sky.bad | is_saturated, find_saturated_cores(is_saturated)
     sky = replace(sky, bad=bad)
     # Stars start where the list or the detection has them, with the wings of the model. `origin` is
     # where a star was first expected, `place` where it was fitted last.
@@ -186,7 +187,7 @@ def photometry(
             side,
             wings,
             0.1 if turn else 1.0,
-            is_saturated,
+            cores,
             with_wings,
         )
         # Noise in the weights would make fluxes too small: from now on they are of the models.

@@ -92,10 +92,8 @@ def fit_stars(
         Places that are known independently of this image, and their standard error along either
         axis, px: the fit is the most probable one, given these. By default, pixels alone decide.
     """
-    fit = _Fit(psfs, image, error, bad, place, min(box_px, psfs.side_px))
+    fit = _Fit(psfs, image, error, bad, place, flux, min(box_px, psfs.side_px))
     middle = fit.start if origin is None else origin[fit.stars]
-    # Fluxes are linear in the pixels: those at the places of the start are one step away.
-    fit.set_flux(fit.best_flux() if flux is None else np.nan_to_num(flux[fit.stars]))
     # A place is known to its range: an even chance of ± a has the variance a²/3.
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
     if place_prior is not None:
@@ -175,13 +173,14 @@ class _Fit:
         error: np.ndarray,
         bad: np.ndarray,
         place: np.ndarray,
+        flux: np.ndarray | None,
         box_px: int,
     ) -> None:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
         # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
         side = psfs.side_px
-        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float64), side)
-        weight = np.pad(np.where(bad, 0.0, 1.0 / error), side)
+        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float32), side)
+        weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), side)
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
         on_image = np.isfinite(place).all(axis=1)
@@ -197,24 +196,35 @@ class _Fit:
         )
         # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
         # are the pixels of all boxes.
-        self.boxes, self._stamps = map(self._pixel_numbers, (box_px, side))
+        self.boxes = self._pixel_numbers(box_px)
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
         # Places and fluxes at the start, the stars' light and its derivatives there.
         self.weight = weight.ravel()[self.boxes]
         self.start = place[self.stars].astype(np.float64)
         self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
+        if flux is not None:
+            self.flux = np.nan_to_num(flux[self.stars].astype(np.float64))
         # Places that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_place, self.pull = self.start, 0.0
         # A star moves so little that its PSF stays as it is at the start, of these fluxes.
         self._mix_splines()
-        self._light = np.empty((len(self.stars), side, side))
+        self._light = np.empty((len(self.stars), side, side), np.float32)
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
-        self._draw(np.arange(len(self.stars)))
+        rows = np.arange(len(self.stars))
+        self._draw(rows)
+        # Fluxes are linear in the pixels: those at the places of the start are one step away.
+        if flux is None:
+            self.flux = self.solve_fluxes()
+            # Where the PSF changes with the magnitude, these fluxes determine it from now on.
+            if self.psfs.magnitudes.size:
+                self._mix_splines()
+                self._draw(rows)
+        self._subtract(rows, self.flux)
 
-    def _pixel_numbers(self, side_px: int) -> np.ndarray:
+    def _pixel_numbers(self, side_px: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return the numbers (m, s, s) of the pixels about stars in the image with its border."""
         axis = np.arange(side_px) - side_px // 2 + self.psfs.side_px
-        row, column = self._middle[:, 1, None] + axis, self._middle[:, 0, None] + axis
+        row, column = (self._middle[rows, k, None] + axis for k in (1, 0))
         return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
     def _mix_splines(self) -> None:
@@ -243,20 +253,14 @@ class _Fit:
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""
-        # Stamps of stars overlap: pixels that several have are subtracted from several times.
-        light = flux[:, None, None] * self._light[rows]
-        np.subtract.at(self.residual.reshape(-1), self._stamps[rows], light)
+        # Stamps of stars overlap: pixels that several have are subtracted from several times. 512
+        # stars at a time, for memory.
+        for part in np.array_split(np.arange(len(rows)), len(rows) // 512 + 1):
+            light = flux[part, None, None].astype(np.float32) * self._light[rows[part]]
+            numbers = self._pixel_numbers(self.psfs.side_px, rows[part])
+            np.subtract.at(self.residual.reshape(-1), numbers.ravel(), light.ravel())
 
-    def set_flux(self, flux: np.ndarray) -> None:
-        """Set the first fluxes (m,) of the stars."""
-        self.flux = flux.astype(np.float64)
-        # Where the PSF changes with the magnitude, these fluxes determine it from now on.
-        if self.psfs.magnitudes.size:
-            self._mix_splines()
-            self._draw(np.arange(len(flux)))
-        self._subtract(np.arange(len(flux)), self.flux)
-
-    def best_flux(self) -> np.ndarray:
+    def solve_fluxes(self) -> np.ndarray:
         """Return the fluxes (m,) that fit best at the places as they are."""
         return self.solve(self._derivatives[:, :1] * self.weight[:, None], np.zeros(1))[0][:, 0]
 

@@ -46,28 +46,40 @@ def find_stars(
     fwhm_px : float
         FWHM of the PSF, px. Stars are at least half of it apart, known ones included.
     """
-    from scipy.ndimage import maximum_filter
     from scipy.spatial import cKDTree
 
     # Tiles of one PSF and one scatter. Beyond 1.5 FWHM, a PSF adds little to S.
     tile_px, half_px = max(64, 16 * int(np.ceil(fwhm_px))), int(np.ceil(1.5 * fwhm_px))
-    margin, peaks, columns = half_px + 1, [], np.arange(0, residual.shape[1], tile_px)
-    for top in range(0, len(residual), tile_px):
+    (height, width), margin = residual.shape, half_px + 1
+    columns, peaks = np.arange(0, width, tile_px), []
+    for top in range(0, height, tile_px):
         # PSFs of stars in the middle of each tile of a row, at the four phases.
         middle = np.stack([columns, np.full(len(columns), top)], axis=1) + tile_px // 2
         centre = (middle[:, None] + PHASES_PX).reshape(-1, 2)
         corner, faint = np.repeat(middle - half_px, 4, axis=0), np.zeros(len(centre))
         psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)[:, 0]
-        for start, tile_psf in zip(columns.tolist(), np.split(psf, len(columns)), strict=True):
-            # The tile, with a margin of as many pixels as the PSF reaches.
-            row, column = max(top - margin, 0), max(start - margin, 0)
-            window = np.s_[row : top + tile_px + margin, column : start + tile_px + margin]
-            snr, flux = measure_snr(residual[window], sigma[window], tile_psf)
-            # Local maxima among all half pixels, as far as they are in the tile.
-            at = np.nonzero((snr > threshold) & (snr == maximum_filter(snr, 3)))
-            y, x = row + at[0] / 2, column + at[1] / 2
-            is_inside = (y // tile_px * tile_px == top) & (x // tile_px * tile_px == start)
-            peaks.append(np.column_stack([x, y, flux[at], snr[at]])[is_inside])
+        # The tiles with a margin of a pixel more than the PSF reaches; σ is infinite off the image.
+        first, end = max(top - margin, 0), min(top + tile_px + margin, height)
+        pads = (first - top + margin, top + tile_px + margin - end), (margin, margin + tile_px)
+        bands = (
+            np.pad(image[first:end], pads, constant_values=outside)
+            for image, outside in ((residual, 0.0), (sigma, np.inf))
+        )
+        windows = [
+            np.stack([band[:, start : start + tile_px + 2 * margin] for start in columns])
+            for band in bands
+        ]
+        snr, flux = measure_snr(*windows, psf.reshape(len(columns), 4, *psf.shape[1:]))
+        # Local maxima among all half pixels of the tile; a pixel more surrounds it.
+        tile, row, column = np.nonzero(snr[:, 2:-2, 2:-2] > threshold)
+        around = np.ix_([1, 2, 3], [1, 2, 3])
+        rows, across = (
+            at[:, None, None] + axis for at, axis in zip((row, column), around, strict=True)
+        )
+        neighbours = snr[tile[:, None, None], rows, across]
+        at = tile, row + 2, column + 2
+        values = [columns[tile] + column / 2, top + row / 2, flux[at], snr[at]]
+        peaks.append(np.stack(values, axis=1)[snr[at] == neighbours.max(axis=(1, 2))])
     stars = np.concatenate(peaks)
     stars = stars[cKDTree(star_positions).query(stars[:, :2])[0] > 0.5 * fwhm_px]
     # Of two peaks that are too near to each other, the lower one is a part of the other.
@@ -77,34 +89,58 @@ def find_stars(
     return stars[:, :2], stars[:, 2]
 
 
-def measure_snr(residual: np.ndarray, sigma: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    """Return S over its scatter, and F, at half pixels of a part (h, w) of an image, (2, 2h, 2w).
+def measure_snr(
+    residual: np.ndarray, sigma: np.ndarray, psf: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return S over its scatter, and F, at the half pixels of n parts of an image.
 
-    `psf` (4, s, s) has the PSFs of stars at `PHASES_PX` from the middle pixel. S is 0 where more
-    than half of Σ P² is in bad pixels.
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (n, h, w)
+        As in `find_stars`.
+    psf : ndarray, shape (n, 4, s, s)
+        PSFs of stars at `PHASES_PX` from the middle pixel, s odd.
+
+    Returns
+    -------
+    snr, flux : ndarray, shape (n, 2(h + 1 − s), 2(w + 1 − s))
+        At the pixels about which a part has the whole PSF. S is 0 where more than half of Σ P² is
+        in bad pixels.
     """
-    from scipy.signal import fftconvolve
+    from scipy import fft
 
     # r/σ and 1/σ: the squares have a number in the unit of `Observation.sky`.
     is_used = np.isfinite(sigma)
     weight, deviation = (1.0 / sigma).astype(np.float32), (residual / sigma).astype(np.float32)
-    # Sums over pixels are convolutions with the mirrored PSF: Σ P r/σ², Σ P²/σ², and Σ P² of
-    # the good pixels.
-    mirror = psf[:, ::-1, ::-1].astype(np.float32)
-    square = np.square(mirror)
-    (height, width), half = sigma.shape, psf.shape[-1] // 2
-    middle = np.s_[:, half : half + height, half : half + width]
-    projection, information, good = (
-        fftconvolve(values.astype(np.float32)[None], kernel, axes=(1, 2))[middle]
-        for values, kernel in ((weight * deviation, mirror), (weight**2, square), (is_used, square))
-    )
-    is_known = good > 0.5 * square.sum(axis=(1, 2), keepdims=True)
+    # Sums over pixels are correlations with the PSF: Σ P r/σ², Σ P²/σ², and Σ P² of the good
+    # pixels. Those that reach across the edge to the other side are cut off.
+    *_, height, width = sigma.shape
+    size = [fft.next_fast_len(side, real=True) for side in (height, width)]
+    inner = np.s_[..., : height + 1 - psf.shape[-1], : width + 1 - psf.shape[-1]]
+    square = np.square(psf.astype(np.float32))
+    kernels = [np.conj(fft.rfft2(values, size)) for values in (psf.astype(np.float32), square)]
+
+    def correlate(values: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+        product = fft.rfft2(values.astype(np.float32), size)[:, None] * kernel
+        return np.asarray(fft.irfft2(product, size)[inner])
+
+    projection = correlate(weight * deviation, kernels[0])
+    information = correlate(weight**2, kernels[1])
+    is_known = np.ones(information.shape, dtype=bool)
+    if not is_used.all():
+        is_known = correlate(is_used, kernels[1]) > 0.5 * square.sum(axis=(2, 3), keepdims=True)
     root = np.sqrt(np.where(is_known, information, np.inf))
     snr = projection / root
     flux = snr / root
-    # Structure of the sky, and undetected stars, are noise of S, too.
-    if is_known.any():
-        snr /= max(SIGMA_OF_MAD * float(np.median(np.abs(snr[is_known]))), 1.0)
+    # Structure of the sky, and undetected stars, are noise of S, too: its median modulus at the
+    # middles of the pixels. Unknown values are last.
+    modulus = np.where(is_known[:, 0], np.abs(snr[:, 0]), np.inf).reshape(len(snr), -1)
+    count = np.count_nonzero(is_known[:, 0], axis=(1, 2))
+    modulus.sort(axis=1)
+    scatter = SIGMA_OF_MAD * modulus[np.arange(len(snr)), np.maximum(count - 1, 0) // 2]
+    snr /= np.where(count > 0, np.maximum(scatter, 1.0), 1.0)[:, None, None, None]
     # The four phases of a pixel are its four half pixels.
-    values = np.stack([snr, flux]).reshape(2, 2, 2, height, width).transpose(0, 3, 1, 4, 2)
-    return values.reshape(2, 2 * height, 2 * width)
+    parts, _, height, width = snr.shape
+    values = np.stack([snr, flux]).reshape(2, parts, 2, 2, height, width)
+    snr, flux = values.transpose(0, 1, 4, 2, 5, 3).reshape(2, parts, 2 * height, 2 * width)
+    return snr, flux

@@ -15,10 +15,9 @@ import numpy as np
 
 from psfdae.base.progress import steps
 from psfdae.image.sky import Sky, subtract_sky
-from psfdae.image.sky_level import level_and_noise
-from psfdae.image.trails import find_saturated_cores
+from psfdae.image.sky_level import add_shared_noise, measure_sky
 from psfdae.psf.wings import Wings, compute_prior_profile, tents
-from psfdae.stars.moments import dither, label_medians
+from psfdae.stars.moments import label_medians
 
 
 class StarFluxes(NamedTuple):
@@ -62,64 +61,89 @@ def tabulate_tents(wings: Wings) -> np.ndarray:
     return np.ascontiguousarray(heights.T)
 
 
-def star_bins(
-    rows: slice, width: int, stars: StarFluxes, wings: Wings
-) -> Iterator[tuple[tuple[slice, slice], float, np.ndarray]]:
-    """Yield windows about the 1000 stars of the brightest wings, F s, and bins of their pixels.
+def select_lit_stars(stars: StarFluxes, wings: Wings) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (m, 2) and F s (m,) of the 1000 stars of the brightest wings.
 
-    A window has rows, counted from `rows.start`, and columns; the bins (rows, columns) are indices
-    of `tabulate_tents`. The image is `width` px wide.
+    In a crowded image, these have most of the light of all wings.
     """
-    reach, radius = int(wings.radius_px[-1]), wings.radius_px
     # F s, the factor of all tents of a star.
     scaled_flux = stars.flux * wings.scale(stars.outer_share)
     # Unlike in `scale`, stars of unknown outer share are left out.
     scaled_flux = np.where(np.isfinite(stars.outer_share), scaled_flux, np.nan)
     is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.place).all(axis=1)
-    # In a crowded image, the thousand brightest stars have most of the light of all wings.
     lit_stars = np.flatnonzero(is_lit)
     brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
-    # Windows of the pixels within reach of a star, as far as they are in these rows: x and y.
-    middle = np.rint(stars.place[brightest]).astype(int)
-    first = np.maximum(middle - reach, [0, rows.start])
-    end = np.minimum(middle + reach + 1, [width, rows.stop])
-    windows = zip(brightest.tolist(), first.tolist(), end.tolist(), strict=True)
-    for star, (column, row), (column_end, row_end) in windows:
-        if column >= column_end or row >= row_end:
-            continue
+    return stars.place[brightest], scaled_flux[brightest]
+
+
+def star_bins(
+    area: tuple[slice, slice], positions: np.ndarray, wings: Wings
+) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray]]:
+    """Yield the number of each star near an area, its window, and bins of the pixels there.
+
+    A window has the pixels of the area that the wings of the star reach, rows and columns from the
+    first ones of the area; the bins (rows, columns) are indices of `tabulate_tents`. `positions`
+    (n, 2) are x and y.
+    """
+    rows, columns = area
+    reach, half_px = int(wings.radius_px[-1]), wings.radius_px[0]
+    # Windows of the pixels within reach of a star, as far as they are in this area: x and y.
+    middle = np.rint(positions).astype(int)
+    first = np.maximum(middle - reach, [columns.start, rows.start])
+    end = np.minimum(middle + reach + 1, [columns.stop, rows.stop])
+    for star in np.flatnonzero((first < end).all(axis=1)).tolist():
+        (x, y), (column, row), (column_end, row_end) = positions[star], first[star], end[star]
         # Distances of the pixels from the star along either axis, and from its centre.
-        x, y = stars.place[star]
         across = (np.arange(column, column_end) - x).astype(np.float32)
         down = (np.arange(row, row_end) - y).astype(np.float32)
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
-        bins = (distance * BINS_PER_PX + 1.5).astype(np.int32)
-        bins[(np.abs(down)[:, None] < radius[0]) & (np.abs(across) < radius[0])] = 0
-        window = np.s_[row - rows.start : row_end - rows.start, column:column_end]
-        yield window, float(scaled_flux[star]), bins
+        distance *= BINS_PER_PX
+        distance += 1.5
+        bins = distance.astype(np.int32)
+        bins[np.ix_(*(np.flatnonzero(np.abs(axis) < half_px) for axis in (down, across)))] = 0
+        window = (
+            slice(row - rows.start, row_end - rows.start),
+            slice(column - columns.start, column_end - columns.start),
+        )
+        yield star, window, bins
 
 
 def draw_tents(
-    shape: tuple[int, ...], stars: StarFluxes, wings: Wings
-) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
-    (height, width), heights = shape, tabulate_tents(wings)
+    shape: tuple[int, ...], stars: StarFluxes, wings: Wings, tile_px: int
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Yield tiles of an image (h, w), and Σ F s h_k of the stars in them, shape (K, rows, columns).
+
+    The shape of tiles that no wings reach is (0, rows, columns).
+    """
+    heights, (positions, scaled_flux) = tabulate_tents(wings), select_lit_stars(stars, wings)
     # The tents of a whole image would take K times its memory.
-    for top in steps("wings", range(0, height, 128)):
-        rows = slice(top, min(top + 128, height))
-        band_tents = np.zeros((rows.stop - top, width, len(wings.profile)), np.float32)
-        for window, scaled_flux, bins in star_bins(rows, width, stars, wings):
-            band_tents[window] += scaled_flux * np.take(heights, bins, axis=0, mode="clip")
-        yield rows, np.moveaxis(band_tents, 2, 0)
+    height, width = shape
+    for top in steps("wings", range(0, height, tile_px)):
+        for left in range(0, width, tile_px):
+            tile = slice(top, min(top + tile_px, height)), slice(left, min(left + tile_px, width))
+            sides = tile[0].stop - top, tile[1].stop - left
+            tile_tents = None
+            for star, window, bins in star_bins(tile, positions, wings):
+                if tile_tents is None:
+                    tile_tents = np.zeros((*sides, len(wings.profile)), np.float32)
+                star_tents = np.take(heights, bins, axis=0, mode="clip")
+                star_tents *= scaled_flux[star]
+                tile_tents[window] += star_tents
+            yield (
+                tile,
+                np.moveaxis(np.empty((*sides, 0)) if tile_tents is None else tile_tents, 2, 0),
+            )
 
 
 def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
     """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
     # One map, to which each star adds the light in its window.
-    image, rows = np.zeros(shape, np.float32), slice(0, shape[0])
+    image, (height, width) = np.zeros(shape, np.float32), shape
     if wings is not None:
         light = (tabulate_tents(wings) @ wings.profile).astype(np.float32)
-        for window, scaled_flux, bins in star_bins(rows, shape[1], stars, wings):
-            image[window] += scaled_flux * np.take(light, bins, mode="clip")
+        positions, scaled_flux = select_lit_stars(stars, wings)
+        for star, window, bins in star_bins(np.s_[0:height, 0:width], positions, wings):
+            image[window] += float(scaled_flux[star]) * np.take(light, bins, mode="clip")
     return image
 
 
@@ -133,8 +157,8 @@ def fit_wings(
 ) -> Wings | None:
     """Fit the wings of stars to what is left of an image without sky and models of its stars.
 
-    An even light, such as a wrong level of the sky, is fitted with them and not returned. Pixels
-    that are more than 4 σ from the wings of an `earlier` fit are left out.
+    An even light, such as a wrong level of the sky, is fitted with them and not returned. Where
+    `earlier` wings are subtracted, pixels more than 4 σ from them are left out.
 
     Parameters
     ----------
@@ -147,19 +171,13 @@ def fit_wings(
     stamp_px : int
         Side of the models' stamps.
     earlier : Wings, optional
-        Wings of the previous fit, whose tents are used again.
+        Wings of the previous fit, which are subtracted from `residual`; their tents are used again.
 
     Returns
     -------
     Wings or None
         None without a star that has light, or without a good pixel.
     """
-    from scipy.ndimage import uniform_filter
-
-    # Six tents, of which the last one ends 2.5 stamps from the star; an earlier fit's tents stay.
-    radius = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7)
-    if earlier is not None:
-        radius = earlier.radius_px
     # The mean of the outer share, weighted with the flux: the share for which s = 1.
     flux, outer_share = stars.flux, stars.outer_share
     has_light = np.isfinite(flux) & (flux > 0) & np.isfinite(outer_share)
@@ -168,40 +186,26 @@ def fit_wings(
     mean_share = float(np.average(outer_share[has_light], weights=flux[has_light]))
     if not mean_share > 0:
         return None
+    # Six tents, of which the last one ends 2.5 stamps from the star. An earlier fit's tents stay;
+    # its profile, which belongs to its own mean share, is rescaled to this one.
+    radius, profile = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7), np.zeros(7)
+    if earlier is not None:
+        radius = earlier.radius_px
+        profile = earlier.profile * (mean_share / earlier.outer_share)
     count = len(radius)
-    wings_without_light = Wings(radius, np.zeros(count), np.zeros((count, count)), mean_share)
-    # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
-    # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
-    # So σ² is averaged over a stamp.
-    variance = np.square(sigma)
-    smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")
-    # A mean is not below the least value, but for the rounding of running sums.
-    np.maximum(smooth_variance, variance.min(), out=smooth_variance)
-    smooth_sigma = np.sqrt(smooth_variance, out=smooth_variance)
-    del variance, smooth_variance
-    # Sums over all pixels for the K numbers p and the even light: N = AᵀA and b = Aᵀd, where a row
-    # of A is (F s h_k, 1)/σ of a pixel, and d its residual over σ; the same in blocks of a stamp.
-    normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
-    square, pixels, blocks = 0.0, 0, []
-    for band, band_tents in draw_tents(residual.shape, stars, wings_without_light):
-        is_used = ~bad[band]
-        if earlier is not None:
-            deviation = residual[band] - np.tensordot(earlier.profile, band_tents, 1)
-            # Undetected stars and galaxies are left out: noise alone hardly exceeds 4 σ.
-            is_used &= np.abs(deviation) < 4.0 * sigma[band]
-        weight = np.where(is_used, 1.0 / smooth_sigma[band].astype(np.float64), 0.0)
-        design = np.concatenate([band_tents, np.ones((1, *weight.shape))]) * weight
-        flat, data = design.reshape(count + 1, -1), (residual[band] * weight).ravel()
-        normal, projection = normal + flat @ flat.T, projection + flat @ data
-        square, pixels = square + float(data @ data), pixels + int(np.count_nonzero(weight))
-        # Blocks at the lower and right edges may be smaller.
-        sums = np.concatenate([design, [residual[band] * weight, weight > 0]])
-        for axis in (1, 2):
-            sums = np.add.reduceat(sums, range(0, sums.shape[axis], stamp_px), axis=axis)
-        blocks.append(sums.reshape(len(sums), -1))
+    tents_of_fit = Wings(radius, profile, np.zeros((count, count)), mean_share)
+    limit = np.inf if earlier is None else 4.0
+    normal, projection, square, pixels, blocks = sum_products(
+        residual, sigma, bad, stars, tents_of_fit, stamp_px, limit
+    )
     if not normal[-1, -1] > 0:
         return None
-    *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
+    *block_design, block_light, block_pixels = blocks
+    # The same of the residual with the earlier wings: d + A p.
+    start = np.append(profile, 0.0)
+    square += 2.0 * float(start @ projection) + float(start @ normal @ start)
+    projection += normal @ start
+    block_light += start @ np.array(block_design)
     # Least squares of p with its prior, and of the even light without one, in units of the prior's
     # σ: (N/χ² + 1) x = b/χ² + μ, without 1 and μ for the even light. χ² is the greatest of 1, χ²
     # of the pixels and χ² of sums over blocks: an uneven sky and undetected sources leave
@@ -226,6 +230,87 @@ def fit_wings(
     return Wings(radius, parameters[:-1], inverse[:-1, :-1], mean_share)
 
 
+class Products(NamedTuple):
+    """Sums over the pixels of an image for the fit of K numbers p, and of an even light.
+
+    A row of the design A is (F s h_k, 1)/σ of a pixel, and d is its residual over σ.
+
+    Attributes
+    ----------
+    normal, projection : ndarray, shape (K + 1, K + 1) and (K + 1,)
+        AᵀA and Aᵀd.
+    square : float
+        dᵀd.
+    pixels : int
+        Number of pixels.
+    blocks : ndarray, shape (K + 3, m)
+        Sums over blocks of a stamp: of the columns of A, of d, and of the pixels.
+    """
+
+    normal: np.ndarray
+    projection: np.ndarray
+    square: float
+    pixels: int
+    blocks: np.ndarray
+
+
+def sum_products(
+    residual: np.ndarray,
+    sigma: np.ndarray,
+    bad: np.ndarray,
+    stars: StarFluxes,
+    wings: Wings,
+    stamp_px: int,
+    limit: float,
+) -> Products:
+    """Return the sums over the pixels of an image (h, w) that fit the profile of wings.
+
+    Parameters are as in `fit_wings`; pixels over `limit` σ are left out, and `wings` give the tents
+    h_k and s.
+    """
+    from scipy.ndimage import uniform_filter
+
+    count = len(wings.profile)
+    normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
+    square, pixels, blocks = 0.0, 0, []
+    tile_px = stamp_px * max(1, 128 // stamp_px)
+    for tile, tile_tents in draw_tents(residual.shape, stars, wings, tile_px):
+        # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves
+        # there, and p_0 times the area of the stamp the light that it lacks, as an aperture would
+        # find it. So σ² is averaged over a stamp, also across the edge of the tile.
+        around = tuple(slice(max(s.start - stamp_px, 0), s.stop + stamp_px) for s in tile)
+        inner = tuple(
+            slice(s.start - a.start, s.stop - a.start) for s, a in zip(tile, around, strict=True)
+        )
+        variance = np.square(sigma[around], dtype=np.float64)
+        smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")[inner]
+        # A mean is not below the least value, but for the rounding of running sums.
+        smooth_variance = np.maximum(smooth_variance, variance.min())
+        # Undetected stars and galaxies are left out.
+        is_used = ~bad[tile] & (np.abs(residual[tile]) < limit * sigma[tile])
+        weight = np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0)
+        columns = [tile_tents, np.ones((1, *weight.shape)), residual[tile][None]]
+        design = np.concatenate(columns) * weight
+        # Of a tile without wings, the design has only the even light.
+        flat = design.reshape(len(design), -1)
+        products, rows = flat @ flat.T, np.s_[count + 2 - len(design) : count + 1]
+        normal[rows, rows] += products[:-1, :-1]
+        projection[rows] += products[:-1, -1]
+        square += float(products[-1, -1])
+        pixels += int(np.count_nonzero(is_used))
+        # Sums over blocks are products with matrices of 0 and 1. Blocks at the lower and right
+        # edges may be smaller.
+        down, across = (
+            np.equal.outer(np.arange(-(-size // stamp_px)), np.arange(size) // stamp_px) * 1.0
+            for size in weight.shape
+        )
+        sums = down @ np.concatenate([design, [is_used]]) @ across.T
+        block = np.zeros((count + 3, sums[0].size))
+        block[count + 2 - len(design) :] = sums.reshape(len(sums), -1)
+        blocks.append(block)
+    return Products(normal, projection, square, pixels, np.concatenate(blocks, axis=1))
+
+
 def add_model_errors(
     error: np.ndarray, star_light: np.ndarray, wing_light: np.ndarray | float = 0.0
 ) -> np.ndarray:
@@ -246,7 +331,7 @@ def around_stars(
     stamp_px: int,
     earlier: Wings | None,
     tolerance: float,
-    is_saturated: np.ndarray,
+    cores: np.ndarray,
     with_wings: bool = True,
 ) -> tuple[Sky, np.ndarray, Wings | None, np.ndarray]:
     """Find wings and sky of an image (h, w) in turns, without the models of its stars.
@@ -267,8 +352,8 @@ def around_stars(
         Wings with which the turns begin.
     tolerance : float
         Turns end when the light of the wings changes by less than this fraction of its error.
-    is_saturated : ndarray of bool, shape (h, w)
-        Saturated pixels.
+    cores : ndarray, shape (k, 3)
+        Saturated cores, middle x, y and radius in px (`find_saturated_cores`).
     with_wings : bool
         False for the sky alone: the wings stay the earlier ones, and no halos are measured.
 
@@ -284,32 +369,75 @@ def around_stars(
     """
     # What is left beside the models has their errors, too.
     sigma = add_model_errors(error, star_light)
-    without_stars = image - star_light
-    wings = earlier
-    if with_wings:
-        wings = _wings_beside(without_stars, sky, sigma, stars, stamp_px, earlier, tolerance)
+    without_stars, bad = image - star_light, sky.bad
+    wings, fitted_stars = earlier, None
+    # Each turn finds the sky without the wings so far, of the same structure, then the wings on
+    # this sky. The sky of the last turn is off by far less than the error of the wings.
+    for _ in steps("light beyond the stamps", range(8)):
+        residual = without_stars - draw_wings(image.shape, stars, wings)
+        known_sky = measure_sky(np.where(bad, 0.0, residual), bad, sky.structure)
+        if not with_wings:
+            break
+        residual -= known_sky.level
+        if fitted_stars is None:
+            # The wings of stars unlike the PSF are subtracted, but not fitted.
+            is_like = is_like_psf(residual, bad, sigma, stars.place)
+            fitted_stars = stars._replace(flux=np.where(is_like, stars.flux, np.nan))
+        previous, wings = wings, fit_wings(residual, sigma, bad, fitted_stars, stamp_px, wings)
+        if wings is None:
+            break
+        # Until their light changes by less than the given fraction of its error.
+        light, light_sigma = wings.light()
+        if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
+            break
     wing_light = draw_wings(image.shape, stars, wings)
-    # The sky without them, of the same structure, and with its noise map if it has one.
+    without_stars -= wing_light
+    # Sky and signal without the wings, with the noise map if the image has one.
     sigma_map = sky.noise if np.isfinite(sky.noise_scale) else None
-    without_light = without_stars - wing_light
-    sky = subtract_sky(without_light, sky.bad, sigma_map, sky.least_noise, structure=sky.structure)
-    del without_light
+    known_sky = add_shared_noise(without_stars, bad, known_sky)
+    sky = subtract_sky(without_stars, bad, sigma_map, sky.least_noise, known_sky)
+    del without_stars
     # The map estimates the mode, below the mean for photon noise and undetected stars. Both
-    # are under stars, too: the mean deviation is added to the level.
-    deviation = (without_stars - sky.level - wing_light) / sigma
-    is_excluded = sky.bad | (np.abs(deviation) > 4.0)
-    # Mean deviation Σ d/σ² divided by Σ 1/σ², of deviations d in counts; in place, as maps of a
-    # large image take much memory.
-    weight = np.where(is_excluded, 0.0, 1.0 / sigma)
-    deviation *= weight
-    weight *= weight
+    # are under stars, too: the mean deviation Σ d/σ² / Σ 1/σ² of all pixels within 4 σ is added
+    # to the level.
+    is_used = ~bad & (np.abs(sky.signal) <= 4.0 * sigma)
+    weight = np.divide(1.0, np.square(sigma), out=np.zeros_like(sigma), where=is_used)
     total_weight = max(float(weight.sum(dtype=np.float64)), np.finfo(float).tiny)
-    even_light = float(deviation.sum(dtype=np.float64)) / total_weight
+    weight *= sky.signal
+    even_light = float(weight.sum(dtype=np.float64)) / total_weight
     sky = replace(sky, level=sky.level + even_light, signal=sky.signal - even_light)
     if not with_wings:
         return sky, wing_light, wings, np.zeros_like(wing_light)
-    halo_error = subtract_halos(sky.signal, wing_light, sky.bad, sigma, stars, wings, is_saturated)
+    halo_error = subtract_halos(sky.signal, wing_light, bad, sigma, stars, wings, cores)
     return sky, wing_light, wings, halo_error
+
+
+def is_like_psf(
+    residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
+    """Return True for stars (n,) that their models fit.
+
+    Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if more
+    than half of the 5 × 5 px about it are good, and the RMS of these is below 2 σ.
+
+    Parameters
+    ----------
+    residual, sigma : ndarray, shape (h, w)
+        Image without sky and stars, and σ of its pixels, which has the errors of the PSF, too.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    positions : ndarray, shape (n, 2)
+        x and y of the stars, NaN where unknown.
+    """
+    column, row = np.rint(np.nan_to_num(positions, nan=-9.0)).astype(int).T
+    axis, (height, width) = np.arange(-2, 3), bad.shape
+    rows, columns = row[:, None, None] + axis[:, None], column[:, None, None] + axis
+    is_inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    at = np.where(is_inside, rows, 0), np.where(is_inside, columns, 0)
+    is_good = is_inside & ~bad[at]
+    count = np.count_nonzero(is_good, axis=(1, 2))
+    square = np.square(residual[at] / sigma[at]).sum(axis=(1, 2), where=is_good)
+    return is_inside[:, 2, 2] & (count > 0.5 * axis.size**2) & (square < 4.0 * count)
 
 
 def subtract_halos(
@@ -319,7 +447,7 @@ def subtract_halos(
     sigma: np.ndarray,
     stars: StarFluxes,
     wings: Wings | None,
-    is_saturated: np.ndarray,
+    cores: np.ndarray,
 ) -> np.ndarray:
     """Subtract the halos of saturated cores, whose stars have no or few pixels to be fitted.
 
@@ -330,14 +458,16 @@ def subtract_halos(
     ----------
     residual, wing_light : ndarray, shape (h, w)
         Image without sky and stars, and light of wings: changed here.
-    bad, is_saturated : ndarray of bool, shape (h, w)
-        Pixels that do not count, and saturated ones.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
     sigma : ndarray, shape (h, w)
         σ of the pixels.
     stars : StarFluxes
         Positions and fluxes of the stars.
     wings : Wings or None
         Wings that were subtracted.
+    cores : ndarray, shape (k, 3)
+        As in `around_stars`.
 
     Returns
     -------
@@ -352,7 +482,7 @@ def subtract_halos(
             residual[:] += light
             wing_light[:] -= light
 
-    cores, halo_error = find_saturated_cores(is_saturated), np.zeros_like(residual)
+    halo_error = np.zeros_like(residual)
     distance = np.hypot(*(stars.place[:, None] - cores[:, :2]).T)
     is_on_core = distance < cores[:, 2:] + 1.0
     is_added = is_on_core.any(axis=0)
@@ -486,52 +616,3 @@ def measure_halo(
     ring_error = np.sqrt(np.maximum(variance, noise_variance))
     error = np.interp(log_r, log_radius[:end_ring], ring_error)
     return Halo(window, light, np.where(log_r > end, 0.5 * np.abs(light), error))
-
-
-def _wings_beside(
-    without_stars: np.ndarray,
-    sky: Sky,
-    sigma: np.ndarray,
-    stars: StarFluxes,
-    stamp_px: int,
-    earlier: Wings | None,
-    tolerance: float,
-) -> Wings | None:
-    """Return the wings of stars in an image (h, w) without its models, in turns with its sky."""
-    from scipy.ndimage import uniform_filter
-
-    wings, all_stars = earlier, stars
-    # Galaxies, blends and saturated stars say nothing of the wings of stars: a star counts if more
-    # than half of the 5 × 5 px about it are good, and the RMS of these is below 2 σ, where σ has
-    # the errors of the PSF, too.
-    residual, bad = without_stars - sky.level, sky.bad
-    squares = np.square(np.where(bad, 0.0, residual / sigma).astype(np.float32))
-    mean_square = uniform_filter(squares, 5, mode="constant")
-    good_fraction = uniform_filter((~bad).astype(np.float32), 5, mode="constant")
-    height, width = bad.shape
-    column, row = np.rint(np.nan_to_num(stars.place, nan=-9.0)).astype(int).T
-    is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    at = np.where(is_inside, row, 0), np.where(is_inside, column, 0)
-    is_star = is_inside & (good_fraction[at] > 0.5) & (mean_square[at] < 4.0 * good_fraction[at])
-    del squares, mean_square, good_fraction  # of a large image, each map takes much memory
-    stars = all_stars._replace(flux=np.where(is_star, all_stars.flux, np.nan))
-    unlike_psf = all_stars._replace(flux=np.where(is_star, np.nan, all_stars.flux))
-    # Each turn finds the sky without the wings so far, then the wings on this sky.
-    for _ in steps("light beyond the stamps", range(8)):
-        previous = wings
-        if previous is not None:
-            without_wings = without_stars - draw_wings(bad.shape, all_stars, previous)
-            without_wings[bad] = 0.0
-            without_wings, _ = dither(without_wings, sky.structure.pixel_step)
-            residual = without_stars - level_and_noise(without_wings, bad, sky.structure)[0]
-            # Stars unlike the PSF have wings, too. Left in the image, these would pass for sky, and
-            # the wings of all stars would come out too small.
-            residual -= draw_wings(bad.shape, unlike_psf, previous)
-        wings = fit_wings(residual, sigma, bad, stars, stamp_px, previous)
-        if wings is None:
-            break
-        # Until their light changes by less than the given fraction of its error.
-        light, light_sigma = wings.light()
-        if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
-            break
-    return wings

@@ -26,6 +26,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.sky import subtract_sky
 from psfdae.image.stamps import cut_image
+from psfdae.image.trails import find_saturated_cores
 from psfdae.photometry import crowded
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.image_photometry import add_unmeasured_rows
@@ -205,9 +206,7 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     outer_part = np.full(30, 0.03)
     true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
     stars = StarFluxes(place, flux, outer_part)
-    bands = draw_tents((300, 300), stars, true)
-    tented = np.concatenate([light for _, light in bands], axis=1)
-    image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
+    image = level + draw_wings((300, 300), stars, true) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
     noise = np.full(image.shape, 5.0), nothing
     wings = fit_wings(image, *noise, stars, 10)
@@ -232,8 +231,7 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
 def test_the_light_of_wings_is_the_sum_over_pixels():
     wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
     star = StarFluxes(np.array([[40.3, 40.1]]), np.ones(1), np.ones(1))
-    bands = draw_tents((81, 81), star, wings)
-    total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in bands)
+    total = draw_wings((81, 81), star, wings).sum()
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
 
@@ -265,11 +263,42 @@ def test_the_outer_share_is_the_light_from_07_to_1_times_half_a_stamp():
     np.testing.assert_allclose(outer_shares(draw, place), expected, rtol=1e-9)
 
 
+def test_wings_in_tiles_are_those_of_the_whole_image():
+    """Σ p h over all tiles is the light of the wings, also of stars beside a tile or the image."""
+    wings = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
+    place = np.array([[20.3, 31.0], [64.0, 2.2], [-9.0, 140.0]])
+    stars = StarFluxes(place, np.array([1.0, 2.0, 5.0]), np.ones(3))
+    whole, light = draw_wings((150, 190), stars, wings), np.full((150, 190), np.nan)
+    empty = 0
+    for tile, tents in draw_tents(whole.shape, stars, wings, 32):
+        empty += len(tents) == 0
+        light[tile] = np.tensordot(wings.profile[: len(tents)], tents, 1)
+    assert light == pytest.approx(whole, rel=1e-5, abs=1e-12)
+    assert 0 < empty < 30 and not whole[100:, 150:].any()
+
+
+def test_an_earlier_fit_keeps_its_light_in_another_mean_share():
+    """Wings fitted again, on what they leave, stay, also by stars of a wider mean PSF."""
+    rng = np.random.default_rng(2)
+    place, flux = rng.uniform(0, 200, (20, 2)), 10 ** rng.uniform(4.5, 5.5, 20)
+    true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    stars = StarFluxes(place, flux, np.linspace(0.02, 0.06, 20))
+    light, none = draw_wings((200, 200), stars, true), np.zeros((200, 200), bool)
+    noise, sigma = rng.normal(0, 5, none.shape), np.full(none.shape, 5.0)
+    first = fit_wings(light + noise, sigma, none, stars, 10)
+    # A few sources that no list has, which an earlier fit leaves out.
+    sources = np.where(rng.random(none.shape) < 0.01, 1000.0, 0.0)
+    left = light + noise + sources - draw_wings(none.shape, stars, true)
+    again = fit_wings(left, sigma, none, stars, 10, true)
+    assert again.outer_share == first.outer_share != true.outer_share
+    assert draw_wings(none.shape, stars, again) == pytest.approx(light, rel=0.03, abs=1.0)
+    assert again.light()[0] == pytest.approx(first.light()[0], abs=3 * first.light()[1])
+
+
 def test_wings_are_round_up_to_their_end():
     wings = Wings(RADIUS, np.full(len(RADIUS), 1e-4), np.eye(len(RADIUS)), 1.0)
     star = StarFluxes(np.array([[40.0, 40.0]]), np.ones(1), np.ones(1))
-    bands = draw_tents((81, 81), star, wings)
-    light = np.concatenate([np.tensordot(wings.profile, tented, 1) for _, tented in bands])
+    light = draw_wings((81, 81), star, wings)
     assert light[40, 64] > 0.0 == light[40, 66]
     for mirrored in (light[::-1], light[:, ::-1], light.T):
         assert mirrored == pytest.approx(light)
@@ -448,7 +477,8 @@ def test_read_noise_limits_the_noise_of_the_sky_in_all_fits():
     sky = subtract_sky(image, none, least_noise=3.0)
     stars = StarFluxes(np.array([[64.0, 64.0]]), np.array([1e3]), np.array([0.03]))
     nothing = np.zeros(image.shape)
-    again = around_stars(image, sky, sky.noise, nothing, stars, 16, None, 1.0, none)[0]
+    no_cores = np.empty((0, 3))
+    again = around_stars(image, sky, sky.noise, nothing, stars, 16, None, 1.0, no_cores)[0]
     assert sky.noise.min() == again.noise.min() == pytest.approx(3.0)
 
 
@@ -463,7 +493,8 @@ def test_wings_of_a_star_on_saturated_cores_without_halos_are_subtracted_once(di
     for column in (100, 100 + distance):
         is_saturated[98:103, column - 2 : column + 3] = True
     residual, wing_light = np.zeros_like(light), light.copy()
-    args = np.zeros(light.shape, bool), np.full(light.shape, 1e3), stars, wings, is_saturated
+    cores = find_saturated_cores(is_saturated)
+    args = np.zeros(light.shape, bool), np.full(light.shape, 1e3), stars, wings, cores
     assert (subtract_halos(residual, wing_light, *args) == 0.0).all()
     assert np.abs(residual).max() <= 1e-6 * light.max()
     assert np.abs(wing_light - light).max() <= 1e-6 * light.max()
