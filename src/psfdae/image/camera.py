@@ -125,9 +125,9 @@ def find_pixel_scale(image: ImageFile) -> CameraValue:
         From the WCS if there is one, else from a key for the scale, else from the width of a
         pixel and the focal length.
     """
-    from astropy.wcs.utils import proj_plane_pixel_area
-
     if image.wcs is not None:
+        from astropy.wcs.utils import proj_plane_pixel_area
+
         # Side of a square as large as a pixel at the reference point.
         with reading(image.path):
             scale = float(np.sqrt(proj_plane_pixel_area(image.wcs))) * 3600.0

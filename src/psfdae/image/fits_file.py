@@ -601,11 +601,11 @@ def read_wcs(header: Header, hdus: HDUList) -> WCS | None:
     hdus : HDUList
         Its file, in which look-up tables of distortions may be.
     """
-    from astropy.wcs import WCS
-
     # Without a scale, astropy would take a pixel for 1 degree.
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
         return None
+    from astropy.wcs import WCS
+
     # wcslib and astropy raise many kinds of errors, all of which mean the same here.
     with suppress(Exception):
         # Axes beyond the plane of the image, such as a wavelength, do not mix with the sky.

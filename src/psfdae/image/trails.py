@@ -56,8 +56,6 @@ def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> Bad
         sky of the image, which was measured for the search, unless squares were searched. Unchanged
         if no sky can be measured, or if a side of the image is below 100 px.
     """
-    from astropy.nddata import block_reduce, block_replicate
-
     if min(image.shape) < 100:
         return bad_pixels
     # Of large images, means of the good pixels in squares are enough, 1000 to 2000 of them along
@@ -65,6 +63,8 @@ def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> Bad
     square_px = max(min(image.shape) // 1000, 1)
     values, bad = image, bad_pixels.mask
     if square_px > 1:
+        from astropy.nddata import block_reduce
+
         values = block_reduce(np.where(bad, 0.0, image), square_px, np.sum)
         count = block_reduce(~bad, square_px, np.sum).astype(values.dtype)
         values, bad = values / np.maximum(count, 1), count == 0
@@ -84,7 +84,7 @@ def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> Bad
     trail_text = "a satellite trail" if trail_count == 1 else f"{trail_count} satellite trails"
     for squares, kind in (spikes, "spikes of saturated stars"), (trails, trail_text):
         # From squares back to pixels; the last rows and columns may be in no square.
-        pixels = block_replicate(squares, square_px, conserve_sum=False)
+        pixels = squares.repeat(square_px, axis=0).repeat(square_px, axis=1)
         margins = [(0, n - m) for n, m in zip(mask.shape, pixels.shape, strict=True)]
         new_mask = np.pad(pixels, margins) & ~mask
         mask |= new_mask

@@ -54,11 +54,14 @@ def measure_photometry(
     truth_flux_error, truth_sigma = (errors[test] for errors in truth_errors)
     positions, noise = field_positions(product)[test], product["noise"][star]
     bright = model.predict(truth, flux=1.0, background=0.0, noise=noise, position=positions)
+    levels, count = sorted(denoised_images, reverse=True), len(test)  # S/N ascending
+    # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
+    gain = np.sqrt(background) / (kappa * np.repeat(levels, count))
+    noisy = np.concatenate([denoised_images[level]["noisy"] for level in levels])
+    estimates = model.predict(noisy, gain=gain, position=np.tile(positions, (len(levels), 1)))
     rows = []
-    for level in sorted(denoised_images, reverse=True):  # S/N ascending
-        # The gain that makes σ = √B / gain the sky noise of stars of flux 1.
-        gain = np.sqrt(background) / (kappa * level)
-        estimate = model.predict(denoised_images[level]["noisy"], gain=gain, position=positions)
+    for number, level in enumerate(levels):
+        estimate = estimates.of(slice(number * count, (number + 1) * count))
         # Stars that have a flux and an error of it.
         usable = np.isfinite(estimate.psf).all(axis=(1, 2)) & (estimate.flux_error > 0)
         # Offsets of the centre, and their standard errors, along x and y.

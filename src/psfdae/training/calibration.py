@@ -25,6 +25,7 @@ from psfdae.denoise.error_model import (
     mahalanobis,
 )
 from psfdae.denoise.flux_model import FluxModel
+from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.stamps import StarFlag
 from psfdae.methods.interface import FitError, Method
@@ -159,13 +160,13 @@ class StarErrors:
         one more star exceeds mean + t (1 + 1/n)^½ σ with this probability, where t is the quantile
         of Student's distribution of n − 1 degrees of freedom, at least 2.
         """
-        from scipy.stats import t
+        from scipy.special import stdtrit
 
         # A star that is seen several times, with other noise, shows no more of what stars are like.
         count = len(np.unique(self.star))
         if count >= 100:
             return np.zeros(len(distance))
-        factor = float(t.ppf(0.999, max(count - 1, 2))) * np.sqrt(1.0 + 1.0 / count)
+        factor = float(stdtrit(max(count - 1, 2), 0.999)) * np.sqrt(1.0 + 1.0 / count)
         return np.asarray(distance.mean(axis=1) + factor * distance.std(axis=1))
 
 
@@ -339,12 +340,39 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
 
     Factors depend on the case, on the noise and on the brightness of a pixel.
     """
-    # Noise as the photometry estimates it, and factors; the last axis of all arrays is the node.
     errors, rng = model.bundle.errors, stream(seed, "noise", "calibration", "scales")
-    nodes = errors.noise
-    node_results = [
-        _scales_at(model, stars, node, rng) for node in steps("errors of fluxes", nodes)
-    ]
+    nodes, count = errors.noise, len(Estimated)
+    # A method that measures stars needs no factor of their fluxes: for their pixels, which are
+    # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
+    step, noise_cases = (3, (True,)) if model.method.knows_field else (1, (False, True))
+    # Rows of a node are cases times images, once with the noise given and once without.
+    draws = [stars.draw(node, rng) for node in nodes]
+    star = draws[0][1]
+    case, image = np.divmod(np.arange(0, count * len(star), step), len(star))
+    is_estimated = np.repeat(noise_cases, len(case))
+    case, image = np.tile(case, len(noise_cases)), np.tile(image, len(noise_cases))
+    # As many nodes at a time as fit in memory.
+    parts = min(-(-len(nodes) * len(case) * stars.images[0].size // 2**20), len(nodes))
+    node_results = []
+    for part in steps("errors of fluxes", np.array_split(np.arange(len(nodes)), parts)):
+        cases = np.tile(case, len(part))
+        prediction = model.predict(
+            np.concatenate([draws[node][0][image] for node in part]),
+            flux=np.where(cases < Estimated.FLUX, 1.0, np.nan),
+            background=np.where(cases < Estimated.FLUX_AND_SKY, 0.0, np.nan),
+            noise=np.where(
+                np.tile(is_estimated, len(part)), np.nan, np.repeat(nodes[part], len(case))
+            ),
+            position=np.tile(stars.position[star[image]], (len(part), 1)),
+        )
+        for number, node in enumerate(part):
+            node_prediction = prediction.of(slice(number * len(case), (number + 1) * len(case)))
+            node_results.append(
+                _scales_at(
+                    node_prediction, model, stars, nodes[node], star[image], case, is_estimated
+                )
+            )
+    # Noise as the photometry estimates it, and factors; the last axis of all arrays is the node.
     noise, scale, flux_scale = (
         np.stack(values, axis=-1) for values in zip(*node_results, strict=True)
     )
@@ -363,9 +391,32 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
 
 
 def _scales_at(
-    model: StarModel, stars: HeldOutStars, node: float, rng: np.random.Generator
+    prediction: Prediction,
+    model: StarModel,
+    stars: HeldOutStars,
+    node: float,
+    star: np.ndarray,
+    case: np.ndarray,
+    is_estimated: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the factors of the errors of noisy test stars of one noise, for each case.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Predictions of n noisy test stars of flux 1.
+    model : StarModel
+        Model of these predictions.
+    stars : HeldOutStars
+        Test stars.
+    node : float
+        RMS of a pixel over the flux.
+    star : ndarray of int, shape (n,)
+        Star of each image.
+    case : ndarray of int, shape (n,)
+        Case of `Estimated`.
+    is_estimated : ndarray of bool, shape (n,)
+        True where the noise is estimated, too.
 
     Returns
     -------
@@ -379,25 +430,9 @@ def _scales_at(
     """
     count = len(Estimated)
     noise, scale, flux_scale = np.full((2, count), node), np.ones((2, 2, count, 2)), 1.0
-    # A method that measures stars needs no factor of their fluxes: for their pixels, which are
-    # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
-    measures = model.method.knows_field
-    step, noise_cases = (3, (True,)) if measures else (1, (False, True))
-    # Rows are cases times images, once with the noise given and once without.
-    noisy, star = stars.draw(node, rng)
-    case, image = np.divmod(np.arange(0, count * len(star), step), len(star))
-    is_estimated = np.repeat(noise_cases, len(case))
-    case, image = np.tile(case, len(noise_cases)), np.tile(image, len(noise_cases))
-    prediction = model.predict(
-        noisy[image],
-        flux=np.where(case < Estimated.FLUX, 1.0, np.nan),
-        background=np.where(case < Estimated.FLUX_AND_SKY, 0.0, np.nan),
-        noise=np.where(is_estimated, np.nan, node),
-        position=stars.position[star[image]],
-    )
     # Errors in units of the half-widths without factors.
     is_finite = np.isfinite(prediction.psf).all(axis=(1, 2))
-    error = stars.errors(prediction.psf, star[image], prediction.uncertainty)
+    error = stars.errors(prediction.psf, star, prediction.uncertainty)
     is_bright = brightest(prediction.psf)
     for index in np.ndindex(noise.shape):
         usable = is_finite & (is_estimated == index[0]) & (case == index[1])
@@ -411,8 +446,8 @@ def _scales_at(
             scale[0, *index, brightness] = np.quantile(error[usable][pixels], COVERAGE)
             scale[1, *index, brightness] = np.quantile(over_ratio[pixels], 0.95)
         # Pull of the flux, |F − 1| / σ_F: 95 % of a normal variable are within 1.96.
-        if index == (1, Estimated.FLUX_AND_SKY) and not measures:
-            flux_sigma = np.hypot(prediction.flux_error, stars.flux_error[star[image]])[usable]
+        if index == (1, Estimated.FLUX_AND_SKY) and not model.method.knows_field:
+            flux_sigma = np.hypot(prediction.flux_error, stars.flux_error[star])[usable]
             pull = np.abs(prediction.flux - 1.0)[usable] / flux_sigma
             flux_scale = float(np.quantile(pull, 0.95) / 1.96)
     return noise, scale, flux_scale

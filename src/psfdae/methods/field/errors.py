@@ -18,9 +18,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psfdae.methods.field.fit import FieldFit, FieldFitter, FieldUncertainty
+from psfdae.methods.field.fit import FieldFit, FieldFitter, FieldUncertainty, FitOptions
 from psfdae.methods.field.prior import FieldPrior
-from psfdae.methods.field.spline import FieldModel, adjust_stars, image_design
+from psfdae.methods.field.spline import (
+    FieldModel,
+    adjust_stars,
+    compute_spacing,
+    field_terms,
+    image_design,
+)
 
 
 class LeftOut(NamedTuple):
@@ -53,35 +59,57 @@ class LeftOut(NamedTuple):
         )
 
 
-def left_out_stars(fitter: FieldFitter, fit: FieldFit) -> Iterator[LeftOut]:
+def left_out_stars(
+    fitter: FieldFitter, fit: FieldFit, options: FitOptions | None = None
+) -> Iterator[LeftOut]:
     """Yield the stars of each fold in turn, with the prediction from the other stars.
 
     Some of the folds are enough if there are many stars. Splines are fitted without the stars of
     the fold, at the fluxes and centres of the fit.
+
+    Parameters
+    ----------
+    fitter : FieldFitter
+        Stars of the fit.
+    fit : FieldFit
+        Fit that has their fluxes, centres and weights.
+    options : FitOptions, optional
+        Options of the splines that are fitted; by default those of the fit. All options are
+        compared on the same stars, of the same weights.
     """
-    settings, spacing = fitter.settings, fit.model.spacing
-    terms = fit.model.terms(fitter.place)
+    settings, model = fitter.settings, fit.model
+    terms, coefficients = model.terms(fitter.place), model.coefficients
     data = fitter.images / fit.flux[:, None, None]
-    star_images = fit.model.images(terms, fit.centre, len(fitter.axis))
+    star_images = model.images(terms, fit.centre, len(fitter.axis))
     # Weights of pixels as at the end of the fit, lower for pixels of neighbours (eq. 3).
     weight = fitter.pixel_weight(fit.flux, star_images)
     noise = fitter.pixel_variance(fit.flux, star_images)
     weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
+    good_weight = weight * fit.good[:, None, None]
+    # Splines begin at those of the fit, or at those of other options fitted to all stars.
+    if options is None:
+        options = fit.options
+    else:
+        ranges = fitter.select_ranges(options.star_terms)
+        terms = field_terms(fitter.place, *ranges, options.order)
+        coefficients = fitter.fit_splines(options, terms, data, good_weight, fit.centre, None)
+        fitter.advance(1)
+    spacing = compute_spacing(len(fitter.axis), options.knots)
     fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
     # Errors are computed in the stamps that a model restores.
     axis = fitter.axis[fitter.in_stamp]
     box = np.ix_(np.arange(len(terms)), fitter.in_stamp, fitter.in_stamp)
     for left_out in range(settings.folds):
-        # Splines without the stars of this fold; the iterations begin at the splines of the fit.
-        used_weight = weight * ((fold != left_out) & fit.good)[:, None, None]
-        coefficients = fitter.fit_splines(
-            fit.options, terms, data, used_weight, fit.centre, fit.model.coefficients
-        )
         rows = np.flatnonzero((fold == left_out) & fit.good)
         if not len(rows):
             continue
+        # Splines without the stars of this fold.
+        fold_weight = good_weight * (fold != left_out)[:, None, None]
+        fold_coefficients = fitter.fit_splines(
+            options, terms, data, fold_weight, fit.centre, coefficients
+        )
         images, is_valid = data[box][rows], fitter.is_valid[box][rows].astype(float)
-        splines = np.tensordot(terms[rows], coefficients, 1)
+        splines = np.tensordot(terms[rows], fold_coefficients, 1)
         # Flux, centre and sky of the stars for these splines; all pixels have the same weight.
         start, steps = fit.centre[rows], settings.left_out_steps
         flux, centre, residual = adjust_stars(
@@ -97,7 +125,7 @@ def left_out_stars(fitter: FieldFitter, fit: FieldFit) -> Iterator[LeftOut]:
         variance = (influence**2 * noise[box][rows].reshape(len(rows), -1)).sum(axis=1)
         variance += np.pi / 2 * (fitter.noise / fit.flux)[rows] ** 2 / fitter.around_px
         yield LeftOut(
-            coefficients=coefficients,
+            coefficients=fold_coefficients,
             light=len(axis) ** 2 / flux * [level, np.sqrt(variance)],
             residual=residual,
             weight=is_valid * np.maximum(star_images[box][rows], 0.0),

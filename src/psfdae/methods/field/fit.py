@@ -271,13 +271,7 @@ class FieldFitter:
     def fit(self, options: FitOptions) -> FieldFit:
         """Fit field, fluxes and centres to all stars in alternation (eq. 2 to 4)."""
         settings, spacing = self.settings, compute_spacing(len(self.axis), options.knots)
-        # Magnitude and colour, if the PSF does not change with them, get a range of zero width
-        # before one with which it does, and are left out otherwise.
-        count = max((1, *options.star_terms)) + 1
-        low, high = self.low[:count].copy(), self.high[:count].copy()
-        for coordinate in range(2, count):
-            if coordinate not in options.star_terms:
-                high[coordinate] = low[coordinate]
+        low, high = self.select_ranges(options.star_terms)
         terms = field_terms(self.place, low, high, options.order)
         # First fluxes are the light in the frames, first centres centroids in a Gaussian window.
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
@@ -338,6 +332,17 @@ class FieldFitter:
         self.advance(1)
         model = FieldModel(coefficients, low, high, spacing)
         return FieldFit(model, options, flux, centre, good, residual)
+
+    def select_ranges(self, star_terms: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return `low` and `high` of x, y and the coordinates with which the PSF changes."""
+        # Magnitude and colour, if the PSF does not change with them, get a range of zero width
+        # before one with which it does, and are left out otherwise.
+        count = max((1, *star_terms)) + 1
+        low, high = self.low[:count].copy(), self.high[:count].copy()
+        for coordinate in range(2, count):
+            if coordinate not in star_terms:
+                high[coordinate] = low[coordinate]
+        return low, high
 
     def pixel_weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return 1/variance w of pixels of flux 1 (eq. 3); 0 where not measured.

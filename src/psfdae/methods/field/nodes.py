@@ -181,11 +181,15 @@ class NodeAxes(NamedTuple):
         min_axes : int
             Minimum number of axes; there are never fewer axes than rows.
         """
-        # Orthonormal basis of the space.
+        # Orthonormal basis of the space: unit vectors of the pixels of the largest diagonal, and
+        # the rows without these pixels, made orthonormal.
         diagonal, derivatives, pixels = node.diagonal, node.derivatives, len(node.diagonal)
         axis_count = min(max(min_axes, len(rows)), pixels)
-        large = np.argsort(-diagonal, kind="stable")[: axis_count - len(rows)]
-        space = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
+        order = np.argsort(-diagonal, kind="stable")
+        large, others = np.split(order, [axis_count - len(rows)])
+        space = np.zeros((pixels, axis_count))
+        space[large, np.arange(len(large))] = 1.0
+        space[others, len(large) :] = np.linalg.qr(rows[:, others].T)[0]
         # Eigenvectors of C in this space, and the mean variance outside of it.
         in_space = rows @ space
         variance, rotation = np.linalg.eigh((space.T * diagonal) @ space + in_space.T @ in_space)

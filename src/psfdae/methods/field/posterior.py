@@ -262,7 +262,7 @@ def mix_posterior(
     count, pixels = stars.images.shape
     sigma, star = stars.prior_sigma()[pairs.star], pairs.star
     nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
-    psf, square, flux, mahalanobis2 = _mix_pixels(prior, stars, pairs, weight, fit)
+    psf, variance, flux, mahalanobis2 = _mix_pixels(prior, stars, pairs, weight, fit)
     # Flux, sky and centre of each pair, and their moments over the nodes. Where the sky is free,
     # the constant (a − Σstar)/P is added to each pixel of the star, so that its flux is a, and
     # subtracted from the sky.
@@ -279,7 +279,7 @@ def mix_posterior(
     )
     # The flux of a faint star differs between nodes. Therefore the mixture is divided by its sum at
     # the end, and psf_sigma includes the error of the flux.
-    psf_sigma = np.sqrt(np.maximum(square - psf**2, 0.0)) / np.abs(total[:, None])
+    psf_sigma = np.sqrt(variance) / np.abs(total[:, None])
     return StarPosterior(
         log_evidence=np.zeros(count),
         flux=first[:, 0],
@@ -301,20 +301,26 @@ def _mix_pixels(
 
     Returns
     -------
-    first, second : ndarray, shape (n, P)
-        Weighted sums over the nodes of star_k and of Var_k + star_k² (eq. 15).
+    psf, variance : ndarray, shape (n, P)
+        Mean of star_k over the nodes, and mean of Var_k + star_k² minus its square (eq. 15).
     flux : ndarray, shape (N,)
         Sum of the pixels of each of N pairs, before the constant for a free sky is added.
     mahalanobis2 : ndarray, shape (N,)
         Squared Mahalanobis distance along the leading axes (eq. 16).
     """
+    # Single precision is enough for differences of a star from its image, which are of the size of
+    # the noise: moments are taken about the image.
     count, pixels = stars.images.shape
-    first, second = np.zeros((2, count, pixels))
+    first, second = np.zeros((2, count, pixels), np.float32)
     flux, mahalanobis2 = np.empty((2, len(pairs.star)))
     # Stars of a flux of about 1.
     images, s = stars.images / stars.unit[:, None], stars.noise_variance()
+    single_images, image_sum = images.astype(np.float32), images.sum(axis=1)
     noise_classes = NoiseClasses.from_noise(s, stars.prior_sigma())
     star, factor = pairs.star, fit.factor[:, None]
+    single_factor, single_weight, variance = (
+        values[:, None].astype(np.float32) for values in (fit.factor, weight, fit.variance)
+    )
     sigma, sky_free = stars.prior_sigma()[star], ~stars.sky_known[star]
     nuisance, nuisance_slope = fit.nuisance_and_slope(sigma)
     gradient, precision = np.empty((len(star), 3)), fit.precision
@@ -338,28 +344,30 @@ def _mix_pixels(
         residual_rows = np.stack([-residual, residual_slope])[:row_sets]
         fraction, along_less_beyond = axes.noise_fractions(s[stars_here])
         corrections = _corrections(axes, nuisance_rows, residual_rows, fraction, along_less_beyond)
-        mean_beyond = fraction * stars.psfs(prior, k, stars_here)
-        star_pixels = corrections[0]
-        star_pixels += (1.0 - fraction) * images[stars_here] + factor[part] * mean_beyond
-        flux[part] = star_pixels.sum(axis=1)
+        fraction = fraction.astype(np.float32)
+        mean_beyond = fraction * stars.psfs(prior, k, stars_here).astype(np.float32)
+        difference = corrections[0]
+        difference += single_factor[part] * mean_beyond
+        difference -= fraction * single_images[stars_here]
+        flux[part] = image_sum[stars_here] + difference.sum(axis=1)
         # Where the sky is free, (a − Σstar)/P is added to each pixel; `mix_posterior` subtracts it
         # from the sky. The derivative is treated likewise, so that its sum is 1.
-        flat_share = sky_free[part, None] / pixels
-        star_pixels += flat_share * (factor[part] - flux[part, None])
+        flat_share = (sky_free[part, None] / pixels).astype(np.float32)
+        difference += flat_share * (factor[part] - flux[part, None]).astype(np.float32)
         # Second moment of the pixels (eq. 14): inside the node, and due to the variance of a.
         second_moment = noise_classes.pixel_variance(axes, stars_here)
-        second_moment += star_pixels**2
+        second_moment += difference**2
         for correction in corrections[1:]:
             change = correction + mean_beyond
             change += flat_share * (1.0 - change.sum(axis=1, keepdims=True))
-            second_moment += fit.variance[part, None] * change**2
+            second_moment += variance[part] * change**2
         # Moments of the mixture (eq. 15).
-        first[stars_here] += weight[part, None] * star_pixels
-        second[stars_here] += weight[part, None] * second_moment
+        first[stars_here] += single_weight[part] * difference
+        second[stars_here] += single_weight[part] * second_moment
     # D² = rᵀG⁻¹r + γᵀ(Λ − Λ₁₂)⁻¹γ (eq. 16): (Λ − Λ₁₂)⁻¹ is the covariance of t/σ without the
     # leading axes.
     mahalanobis2 += (gradient * np.linalg.solve(precision, gradient[..., None])[..., 0]).sum(axis=1)
-    return first, second, flux, mahalanobis2
+    return images + first, np.maximum(second - first**2, 0.0), flux, mahalanobis2
 
 
 class NoiseClasses(NamedTuple):
@@ -392,10 +400,14 @@ class NoiseClasses(NamedTuple):
         return cls(number, np.exp(ln_step * noise_step[example]), sigma[example])
 
     def pixel_variance(self, axes: NodeAxes, stars: np.ndarray) -> np.ndarray:
-        """Return the variance (n, P) of the pixels of the stars with these indices in a node."""
+        """Return the variance (n, P) of the pixels of the stars with these indices in a node.
+
+        It is in single precision.
+        """
         # Once for each class that occurs.
         classes, index = np.unique(self.number[stars], return_inverse=True)
-        return np.asarray(axes.pixel_variance(self.variance[classes], self.sigma[classes])[index])
+        variance = axes.pixel_variance(self.variance[classes], self.sigma[classes])
+        return variance.astype(np.float32)[index]
 
 
 def _corrections(
@@ -423,13 +435,13 @@ def _corrections(
 
     Returns
     -------
-    ndarray, shape (R, n, P)
+    ndarray, shape (R, n, P), float32
         Corrections of the pixels.
     """
     # Weights of the rows of the basis; the first row is the sky.
     weights = np.concatenate([fraction * nuisance, along_less_beyond * residual], axis=2)
     weights[..., 0] -= nuisance[..., 0]
-    return np.asarray(weights @ axes.basis)
+    return np.asarray(weights.astype(np.float32) @ axes.basis.astype(np.float32))
 
 
 def _second_moments(

@@ -61,7 +61,7 @@ class PosteriorLimits:
     max_node_area_px2: float = 3.0
     min_axes: int = 96
     outlier_axes: int = 12
-    stars_at_once: int = 1024
+    stars_at_once: int = 2048
 
 
 class FieldSettings(Group):

@@ -13,14 +13,19 @@ neighbours. All return a `FieldFit`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
 from psfdae.base.progress import task
-from psfdae.methods.field.errors import field_uncertainty, left_out_error
+from psfdae.methods.field.errors import (
+    LeftOut,
+    field_uncertainty,
+    left_out_error,
+    left_out_stars,
+)
 from psfdae.methods.field.fit import FieldFit, FieldFitter, FitOptions, FitSettings
 from psfdae.methods.field.prior import FieldSettings
 from psfdae.methods.field.spline import FieldModel, compute_spacing, count_knots
@@ -71,12 +76,13 @@ def fit_field(
         determined_orders = [o for o in usable_orders if 3 * (o + 1) * (o + 2) <= 4 * len(stars)]
         usable_orders = determined_orders or usable_orders[:1]
     options = FitOptions(count_knots(frame_px, spacing), smoothness, usable_orders[0])
-    # Largest number of fits: ten for knots and smoothness, all orders, three for magnitude and
-    # colour, the final one and four for the uncertainty.
-    with task("field", 10 + len(usable_orders) + 3 + 5) as advance:
+    # Largest number of fits: one for the search, ten for knots and smoothness, all orders, three
+    # for magnitude and colour, the final one and four for the uncertainty.
+    with task("field", 11 + len(usable_orders) + 3 + 5) as advance:
         fitter = replace(fitter, advance=advance)
         if len(orders) > 1 and len(stars) >= 3:
-            options = _search_options(fitter, options, usable_orders)
+            first_spacing = choose_spacing(stars, spacing)
+            options = _search_options(fitter, options, usable_orders, first_spacing)
         fit = fitter.fit(options)
         # Two stars are too few to leave one out.
         if rng is None or len(stars) < 3:
@@ -112,15 +118,75 @@ def fit_first_field(
     """
     fitter = FieldFitter.build(stars, background, frame_px, stamp_px)
     order = max(o for o in range(5) if o == 0 or 2 * (o + 1) * (o + 2) <= len(stars))
-    # Cubic splines with knots 0.7 σ apart follow a Gaussian of that σ to 0.2 % of its peak. The
-    # noise-equivalent area of a star is A = 4πσ². Rings are finer than that.
-    sigma_px = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
-    spacing = np.clip(0.7 * sigma_px, settings.spacing_px, 2.0 * settings.spacing_px)
-    knots = count_knots(frame_px, float(spacing))
+    knots = count_knots(frame_px, choose_spacing(stars, settings.spacing_px))
     return fitter, fitter.fit(FitOptions(knots, settings.smoothness, order))
 
 
-def _search_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[int]) -> FitOptions:
+def choose_spacing(stars: BrightStars, spacing: float) -> float:
+    """Return a distance of knots that follows most stars, from `spacing` to twice as much."""
+    # Cubic splines with knots 0.7 σ apart follow a Gaussian of that σ to 0.2 % of its peak. The
+    # noise-equivalent area of a star is A = 4πσ². Rings are finer than that.
+    sigma_px = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
+    return float(np.clip(0.7 * sigma_px, spacing, 2.0 * spacing))
+
+
+class _Comparison:
+    """Comparison of options by the prediction of left-out stars, at the centres of one fit.
+
+    Squared errors of the same stars are compared by the mean difference of their logarithms, which
+    gives faint and bright stars the same influence.
+
+    Parameters
+    ----------
+    fitter : FieldFitter
+        Stars of the fits.
+    fit : FieldFit
+        Fit that has their fluxes, centres and weights.
+    """
+
+    def __init__(self, fitter: FieldFitter, fit: FieldFit) -> None:
+        self.fitter, self.fit = fitter, fit
+        self._predictions: dict[FitOptions, tuple[Iterator[LeftOut], list[np.ndarray]]] = {}
+
+    def is_better(self, options: FitOptions, others: FitOptions, factor: float = 1.0) -> bool:
+        """Return True if the squared errors are smaller than with other options, times a factor.
+
+        The comparison ends after as many folds as show the difference at 4 σ.
+        """
+        gain = np.empty(0)
+        for fold in range(self.fitter.settings.folds):
+            errors, other_errors = (self._fold_errors(o, fold) for o in (options, others))
+            gain = np.append(gain, other_errors - errors + np.log(factor))
+            if len(gain) >= 20 and abs(gain.mean()) > 4.0 * gain.std() / np.sqrt(len(gain)):
+                break
+        return bool(gain.mean() > 0)
+
+    def find_best(self, steps: Sequence[FitOptions], first: int = 0) -> FitOptions:
+        """Return the best of options in their order, from the first on, upwards or else down."""
+        best = first
+        for direction in (1, -1):
+            while 0 <= (number := best + direction) < len(steps) and self.is_better(
+                steps[number], steps[best]
+            ):
+                best = number
+            if best != first:
+                break
+        return steps[best]
+
+    def _fold_errors(self, options: FitOptions, fold: int) -> np.ndarray:
+        """Return ln of the squared errors of the stars of a fold; empty after the last fold."""
+        if options not in self._predictions:
+            self._predictions[options] = left_out_stars(self.fitter, self.fit, options), []
+        parts, errors = self._predictions[options]
+        while len(errors) <= fold:
+            part = next(parts, None)
+            errors.append(np.empty(0) if part is None else np.log(part.compute_squared_errors()))
+        return errors[fold]
+
+
+def _search_options(
+    fitter: FieldFitter, options: FitOptions, orders: Sequence[int], first_spacing: float
+) -> FitOptions:
     """Return the options with which left-out stars are predicted best.
 
     Parameters
@@ -128,60 +194,50 @@ def _search_options(fitter: FieldFitter, options: FitOptions, orders: Sequence[i
     fitter : FieldFitter
         Stars of the fits.
     options : FitOptions
-        Options at the start: the smallest distance of knots, and the smallest smoothness.
+        The smallest distance of knots, and the smallest smoothness.
     orders : sequence of int
         Orders of the polynomial, ascending.
+    first_spacing : float
+        Distance of knots at which the search begins.
     """
-
-    @cache
-    def compute_error(options: FitOptions) -> float:
-        return left_out_error(fitter, fitter.fit(options))
-
     final_tolerance = options.tolerance
     # Splines first, with a polynomial that follows most of the field: with splines that follow
     # noise, higher orders would not seem to pay. Orders up to 2 are all tried, because a symmetric
     # field has no slope.
     curved_order = 2
-    start = max((o for o in orders if o <= curved_order), default=orders[0])
-    options = replace(options, order=start, tolerance=fitter.settings.compared_tolerance)
-    least_error = compute_error(options)
-    # Knots √2 farther apart, at most six times, then splines ten times as smooth, at most three
-    # times.
-    frame_px = len(fitter.axis)
-    for steps, coarser, smoother in ((6, 2.0**0.5, 1.0), (3, 1.0, 10.0)):
-        for _ in range(steps):
-            spacing = coarser * compute_spacing(frame_px, options.knots)
-            step = replace(
-                options,
-                knots=count_knots(frame_px, spacing),
-                smoothness=smoother * options.smoothness,
-            )
-            if (error := compute_error(step)) >= least_error:
-                break
-            options, least_error = step, error
+    first_order = max((o for o in orders if o <= curved_order), default=orders[0])
+    options = replace(options, order=first_order, tolerance=fitter.settings.compared_tolerance)
+    # Distances of knots in six steps of √2, from the one on that is nearest to the first.
+    frame_px, knot_steps = len(fitter.axis), [options]
+    for _ in range(6):
+        spacing = 2.0**0.5 * compute_spacing(frame_px, knot_steps[-1].knots)
+        knot_steps.append(replace(options, knots=count_knots(frame_px, spacing)))
+    spacings = np.array([compute_spacing(frame_px, step.knots) for step in knot_steps])
+    first = int(np.abs(np.log(spacings / first_spacing)).argmin())
+    comparison = _Comparison(fitter, fitter.fit(knot_steps[first]))
+    options = comparison.find_best(knot_steps, first)
+    # Splines ten times as smooth, at most three times.
+    options = comparison.find_best(
+        [replace(options, smoothness=10.0**k * options.smoothness) for k in range(4)]
+    )
     # Orders from the lowest to the first one that does not pay.
-    best_order, least_error = 0, np.inf
-    for order in orders:
-        error = compute_error(replace(options, order=order))
+    order_steps = [replace(options, order=order) for order in orders]
+    options = order_steps[0]
+    for step in order_steps[1:]:
         # Most fields are curved. Higher orders must pay clearly, because noise may favour them.
-        if error < (1.0 if order <= curved_order else 0.99) * least_error:
-            best_order, least_error = order, error
-        elif order >= curved_order:
+        if comparison.is_better(step, options, 1.0 if step.order <= curved_order else 0.99):
+            options = step
+        elif step.order >= curved_order:
             break
-    options = replace(options, order=best_order)
     # Magnitude and colour, the better one first, because the other may only be correlated with it.
     # Each must reduce the error by 2 %.
     coordinates = [c for c in range(2, len(fitter.high)) if fitter.high[c] > fitter.low[c]]
     while coordinates:
-        steps_by_error = [
-            (compute_error(step), step)
-            for c in coordinates
-            if (step := replace(options, star_terms=(*options.star_terms, c)))
-        ]
-        error, step = min(steps_by_error, key=lambda error_and_step: error_and_step[0])
-        if error >= 0.98 * least_error:
+        steps = [replace(options, star_terms=(*options.star_terms, c)) for c in coordinates]
+        step = comparison.find_best(steps)
+        if not comparison.is_better(step, options, 0.98):
             break
-        options, least_error = step, error
+        options = step
         coordinates.remove(step.star_terms[-1])
     return replace(options, tolerance=final_tolerance)
 
