@@ -301,9 +301,9 @@ def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
             difference = change - last_change
             squares = np.maximum((difference * difference).sum(axis=0), 1e-12)
             theta = np.clip((change * difference).sum(axis=0) / squares, -9.0, 0.5)
-            x, y, *moments = update - theta * (update - last_update)
-            x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in (x, y))
-            gaussian = np.stack([x, y, *_bound_moments(*moments, side)])
+            x, y, xx, xy, yy = update - theta * (update - last_update)
+            centre = np.clip([x, y], -0.5 * side, 0.5 * side)
+            gaussian = np.stack([*centre, *_bound_moments(xx, xy, yy, side)])
         last_update, last_change = update, change
     return np.where(has_light, update[2:], np.nan)
 

@@ -55,7 +55,10 @@ def find_rule(name: str, table: pd.DataFrame) -> tuple[list[str], Scatter]:
     """
     for pattern, rule in TABLES.items():
         if fnmatch(name, pattern):
-            return rule["row"], rule["scatter"]
+            # The axes of a sweep are between the name of the point and its status.
+            columns, row = [*table.columns], rule["row"]
+            axes = columns[1 : columns.index("status")] if row == "axes" else row
+            return axes, rule["scatter"]
     numbers = _to_numbers(table)
     text_columns = [c for c in table.columns if c == "noise_level" or numbers[c].isna().all()]
     values = [c for c in table.columns.difference(text_columns) if not MACHINE.fullmatch(c)]

@@ -227,6 +227,19 @@ def test_tables_within_their_scatter_are_not_named(tmp_path):
     assert "3 rows are in one alone" in output and "Not in A: tables/stability.csv" in output
 
 
+@pytest.mark.parametrize("name", ["dae_crop", "network_epochs"])
+def test_points_of_a_sweep_are_compared_by_their_values(tmp_path, name):
+    """Their names change with any setting, such as a new one that has its old value."""
+    for file in ("summary", "cost"):
+        path = f"sweeps/{name}/{file}.csv"
+        table = pd.read_csv(RECORD / path)
+        table = table.assign(point=[f"{row:012x}" for row in range(len(table))])
+        write_text(tmp_path / path, table.to_csv(index=False))
+        values = record_tables.compare_values(tmp_path, RECORD, path)
+        assert set(values.verdict) == ({"equal"} if file == "summary" else set())
+        assert values.row.nunique() == (len(table) if file == "summary" else 0)
+
+
 def test_tables_that_lack_a_standard_error_are_compared(tmp_path):
     """Each column that an expression names; values without it scatter as of a fit."""
     lacking = []
