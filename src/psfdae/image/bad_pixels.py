@@ -471,12 +471,14 @@ def find_cosmic_rays_in_band(
         large[0] = False
         forbidden |= scipy.ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
     cosmic = np.zeros(band.shape, dtype=bool)
-    # Tracks are found from their ends inwards: found pixels are replaced, and the search repeats.
+    # Tracks are found from their ends inwards: found pixels are replaced, and the search repeats
+    # where pixels of the windows about a pixel changed.
+    is_changed: np.ndarray | bool = True
     for _ in range(8):
         # L⁺ of all pixels; half of the limit on a cosmic ray picks out those that are worth a
         # closer look.
         edge = compute_edges(clean)
-        row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden & ~cosmic)
+        row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden & ~cosmic & is_changed)
         if not row.size:
             break
         sigma = _measure_noise(clean, noise, row, column)
@@ -494,6 +496,7 @@ def find_cosmic_rays_in_band(
             break
         cosmic |= new
         clean = fill_bad(clean, cosmic | bad)[0]
+        is_changed = scipy.ndimage.maximum_filter(new, 15)
     return cosmic
 
 

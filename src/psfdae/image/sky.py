@@ -165,7 +165,7 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
     levels, noises, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
-    deviations = np.full((len(starts), square_px + 4, columns), np.nan)
+    deviations = np.full((len(starts), square_px + 4, columns), np.nan, np.float32)
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
         for start, deviation in zip(starts, deviations, strict=True):
             band = pixels[start : start + square_px]
@@ -190,11 +190,16 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     # White pixels are found by the parity of row and column, as bands begin at even rows. Means of
     # values that are clipped at 3 σ, against stars: medians of whole counts would mostly be equal.
     bands = deviations.reshape(-1, columns)
-    is_white = np.indices(bands.shape).sum(axis=0) % 2 == 0
-    white, black = (np.clip(bands[colour], -3.0, 3.0) for colour in (is_white, ~is_white))
-    checker = float(np.nanmean(white) - np.nanmean(black))
-    # Resampled pixels share noise: sums of them scatter by more than independent ones.
-    correlation = noise_correlation(bands)
+    clipped = np.clip(bands, -3.0, 3.0)
+    white, black = (
+        np.nanmean(np.append(clipped[::2, first::2], clipped[1::2, 1 - first :: 2]), dtype=float)
+        for first in (0, 1)
+    )
+    checker = float(white - black)
+    # Resampled pixels share noise: sums of them scatter by more than independent ones. 512 × 512 px
+    # are enough, of which a correlation has the error 0.003.
+    middle = tuple(slice(max(0, size // 2 - 256), size // 2 + 256) for size in bands.shape)
+    correlation = noise_correlation(bands[middle])
     noise = correlation * float(np.median(noises))
     return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
 
@@ -282,7 +287,8 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     level, noise : ndarray, shape (n,)
         Median and σ of a pixel, in the unit of the stamps; 0 where all pixels are bad.
     """
-    from astropy.stats import sigma_clipped_stats
+    from astropy.stats import SigmaClip
+    from astropy.utils.exceptions import AstropyUserWarning
 
     # The ring around the stamp.
     side = window.shape[-1]
@@ -294,13 +300,19 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
     window, dither_variance = dither(window, step)
     # Pixels of the ring more than 3 σ off their median belong to other stars.
+    values = np.where(bad[:, ring], np.nan, window[:, ring])
     with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyUserWarning)  # bad pixels are no numbers
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
-        _, level, noise = sigma_clipped_stats(
-            window[:, ring], mask=bad[:, ring], sigma=3.0, stdfunc="mad_std", axis=1
-        )
-    # If all pixels of all stamps are bad, both are one masked value; bad stamps get 0.
-    statistics = np.stack([np.ma.filled(values, np.nan) for values in (level, noise)])
-    statistics = np.nan_to_num(statistics).astype(float)
-    level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
+        values = SigmaClip(3.0, stdfunc="mad_std")(values, axis=1, masked=False)
+        level, noise = _row_medians(values), np.nanstd(values, axis=1, dtype=np.float64)
+    level, noise = np.nan_to_num(level).astype(np.float64), np.nan_to_num(noise)
     return level, np.where(noise > 0, remove_dither(noise, dither_variance), 0.0)
+
+
+def _row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the median (n,) of each row (n, m) without its NaN; NaN if all values are."""
+    # NaN are last in the order. A sort of all rows takes a tenth of the time of `np.nanmedian`.
+    values, count = np.sort(values, axis=1), np.count_nonzero(~np.isnan(values), axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    return np.asarray(np.take_along_axis(values, middle, axis=1).mean(axis=1))

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from psfdae.image.errors import silent
-from psfdae.image.stamps import cut_image
+from psfdae.image.stamps import cut, cut_image
 from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, robust_scatter
 
 
@@ -104,16 +104,18 @@ def measure_size(data: np.ndarray, bad: np.ndarray, position: np.ndarray) -> Sou
     windows_at = (data.shape, brightest[:, 1], brightest[:, 0], 145, 0)
     windows, inside, _ = cut_image(clean, *windows_at)
     is_measured = inside & (cut_image(bad, *windows_at)[0] == 0)
-    # The centre under a window as wide as the star, from the first profile.
+    # The centre under a window as wide as the star, from the first profile; 5 σ of it are enough.
+    visible = np.where(is_measured, windows, 0.0)
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):
         size = measure_windows(windows, is_measured, centre)
         if size is None:
             return None
         # A ring is dark in its middle: a window narrower than its radius would drift off.
-        sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
-        visible = np.where(is_measured, windows, 0.0)
-        centre = find_centroids(visible, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
+        sigma, reach_px = max(size.fwhm_px / FWHM_OF_SIGMA, 0.7), max(size.fwhm_px, 1.5)
+        middle = cut(visible, min(2 * int(np.ceil(5.0 * sigma + reach_px)) + 1, windows.shape[-1]))
+        sigmas = np.full(len(windows), sigma)
+        centre = find_centroids(middle, np.zeros_like(centre), sigmas, 10, reach_px)
     return measure_windows(windows, is_measured, centre)
 
 
@@ -201,10 +203,11 @@ def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.
     values, radius : ndarray, shape (n,)
         Pixels of the star, and their distances from its centre.
     edges : ndarray, shape (k + 1,)
-        Radii, ascending.
+        Radii, whole numbers, ascending.
     """
     # Pixels in the order of their rings; rings are small whole numbers, which are sorted by digits.
-    ring = (np.digitize(radius, edges) - 1).astype(np.int16)
+    pixel_ring = np.digitize(np.arange(int(radius.max(initial=0.0)) + 1), edges) - 1
+    ring = pixel_ring.astype(np.int16)[radius.astype(np.int16)]
     order = np.argsort(ring, kind="stable")
     values, starts = values[order], np.searchsorted(ring[order], np.arange(len(edges)))
     light = np.full(len(edges) - 1, np.nan)
@@ -214,7 +217,9 @@ def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.
             continue
         if edges[k + 1] > 4:
             # Median: the mean of the one or two middle values.
-            middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
-            pixels = np.partition(pixels, middle)[middle]
-        light[k] = pixels.mean()
+            low, high = (len(pixels) - 1) // 2, len(pixels) // 2
+            pixels = np.partition(pixels, (low, high))
+            light[k] = 0.5 * (pixels[low] + pixels[high])
+        else:
+            light[k] = pixels.mean()
     return light

@@ -78,10 +78,14 @@ class StarErrors:
         Nodes are the RMS of a pixel divided by the flux. Distances are along the leading
         `components` of the flux model.
         """
-        # Each star at each node of the noise; all are denoised together.
+        # Each star at each node of the noise; all are denoised together. A star of an image has
+        # several images, half of which are enough for a method that knows the field: few stars
+        # limit its half-widths, not the noise.
         draws = [stars.draw(node, rng) for node in nodes]
+        count = len(draws[0][1]) // (2 if method_fit.knows_field else 1)
+        draws = [(images[:count], star[:count]) for images, star in draws]
         noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
-        noise = np.repeat(nodes, len(draws[0][1]))
+        noise = np.repeat(nodes, count)
         level = noise / stars.noise.kappa
         estimate = method_fit.estimate(noisy, level, stars.position[star])
         # A method that scores stars by themselves does so in its form for estimated fluxes, as it
@@ -343,8 +347,8 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     errors, rng = model.bundle.errors, stream(seed, "noise", "calibration", "scales")
     nodes, count = errors.noise, len(Estimated)
     # A method that measures stars needs no factor of their fluxes: for their pixels, which are
-    # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
-    step, noise_cases = (3, (True,)) if model.method.knows_field else (1, (False, True))
+    # many, a sixth of the images is enough in each case. Its errors are the same if noise is known.
+    step, noise_cases = (6, (True,)) if model.method.knows_field else (1, (False, True))
     # Rows of a node are cases times images, once with the noise given and once without.
     draws = [stars.draw(node, rng) for node in nodes]
     star = draws[0][1]
@@ -500,20 +504,19 @@ def cross_validate_coverage(errors: StarErrors) -> Callable[[np.ndarray, float],
     """
     # Stars that gave the half-widths would be covered too often: each half is judged by the other.
     count = 1 + int(errors.star.max())
-    is_even = np.arange(count) % 2 == 0
     halves = []
-    for half in (is_even, ~is_even) if count > 1 else ():
-        other_half = errors.select(~half)
+    for parity in (0, 1) if count > 1 else ():
+        other_half = errors.select(np.arange(count) % 2 != parity)
         width = other_half.half_width68
         width95 = (width * other_half.ratio95()[:, None, None]).astype(width.dtype)
-        halves.append((half, {"coverage68": width, "coverage95": width95}))
+        halves.append((parity, {"coverage68": width, "coverage95": width95}))
 
     # Each half by the map of the other half, at the noise that is asked for; then their mean.
     def measure_coverage(error: np.ndarray, noise: float) -> dict[str, float]:
         coverages: dict[str, list[float]] = {}
-        for half, widths in halves:
+        for parity, widths in halves:
             for name, maps in widths.items():
-                is_inside = error[half] <= interpolate_at_noise(
+                is_inside = error[parity::2] <= interpolate_at_noise(
                     np.array([noise]), errors.nodes, maps
                 )
                 coverages.setdefault(name, []).append(float(is_inside.mean()))
