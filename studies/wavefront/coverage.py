@@ -107,6 +107,7 @@ def stars(out, count=500):
     counts = noisy(images, snr, rng)
     started = time.process_time()
     result = psfdae.wavefront(counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5)
+    result.interval()  # the draws are made when they are needed
     took = time.process_time() - started
     rows = []
     for probability in (0.6827, 0.9545):

@@ -16,6 +16,7 @@ STARS = ["grid.points=3", "stars.count=200"]
 TRAINED = ["parts.train_stars=160", "parts.test_stars=40", *STARS]
 TINY = {
     "simulate": ["grid.points=3"],
+    "train": ["--method", "lmmse", "parts.train_stars=200", "parts.test_stars=40"],
     "stars": STARS,
     "fit": ["train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]", *TRAINED],
     "bundle": TRAINED,

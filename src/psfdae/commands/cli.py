@@ -417,7 +417,7 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     Raises
     ------
     click.MissingParameter
-        If no files are left.
+        If no files are left of a required argument.
     """
     # Without files, the words have an argument of their own (`as_click`).
     if "overrides" in values:
@@ -428,7 +428,7 @@ def _settings(parameters: Sequence[click.Parameter], values: dict[str, Any]) -> 
     name = argument.name or ""
     settings = [str(word) for word in values[name] if re.match("[^/]*=", str(word))]
     values[name] = tuple(word for word in values[name] if str(word) not in settings)
-    if not values[name]:
+    if not values[name] and argument.required:
         raise click.MissingParameter(param=argument)
     return settings
 

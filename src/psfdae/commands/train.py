@@ -33,6 +33,7 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae.report.validation import validate
+from psfdae.telescope.settings import read_telescope
 from psfdae.training.exposures import adapt_to_exposures
 from psfdae.training.fitting import (
     choose_method,
@@ -51,6 +52,7 @@ from psfdae.training.settings import (
     make_settings,
 )
 from psfdae.training.stars import ImageStars
+from psfdae.training.telescope_stars import simulate_stars
 
 
 class FolderError(Error, RuntimeError):
@@ -112,8 +114,11 @@ class ModelFiles:
 @command("train", SettingsReader())
 def train_command(
     config: Settings | Mapping[str, Any],
-    image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
     options: ImageOptions,
+    image: Annotated[
+        tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}
+    ] = (),
+    telescope: File | None = None,
     all_extensions: bool = False,
     name: str | None = None,
     licence: str = "not stated",
@@ -131,15 +136,18 @@ def train_command(
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
+    With --telescope in place of IMAGE, stars of a telescope that a file describes are simulated.
 
     Parameters
     ----------
     config : Settings or mapping
         Settings of the training, from overrides or a file.
-    image : sequence of Path
-        FITS images of one camera, or one FITS cube of stamps.
     options : ImageOptions
         Options of the image, and its star list.
+    image : sequence of Path
+        FITS images of one camera, or one FITS cube of stamps.
+    telescope : Path, optional
+        YAML file of a telescope, as in config/telescope, whose stars are simulated.
     all_extensions : bool
         All images of the file, each by itself and in parallel; OUT gets their names.
     name : str, optional
@@ -170,6 +178,14 @@ def train_command(
         # A given size is used even if stars have light beyond it.
         size_settings["light_min"] = 0.0
     settings = apply_keywords(make_settings(config), Settings.image_groups, size_settings)
+    if (telescope is None) != bool(image):
+        raise ConfigError("psfdae train takes images or --telescope, one of them")
+    if telescope is not None:
+        if all_extensions or options != ImageOptions():
+            raise ConfigError("--telescope takes no options of an image")
+        return train_on_telescope(
+            settings, telescope, name, licence, method_name, out, page, overwrite
+        )
     stem, sentence = model_name(image, name), ""
     if all_extensions and len(image) > 1:
         raise ObservationError(image[1], "--all-extensions takes one file with images")
@@ -196,6 +212,41 @@ def train_command(
             sentence = write_model(settings, sources, files, licence, candidates, page)
         print(sentence)
     print(f"next: {next_command(image, options, all_extensions, name, out)}")
+    return sentence
+
+
+def train_on_telescope(
+    settings: Settings,
+    telescope_path: Path,
+    name: str | None,
+    licence: str,
+    method_name: str | None,
+    out: Path,
+    page: Path | None,
+    overwrite: bool,
+) -> str:
+    """Train a model on simulated stars of a telescope, and return a sentence on its error.
+
+    Parameters are as for `train_command`.
+
+    Raises
+    ------
+    ConfigError
+        If the method learns positions in an image, or the file does not describe a telescope.
+    """
+    if method_name is not None and method(method_name).knows_field:
+        raise ConfigError(f"--method {method_name}: learns positions in an image; not --telescope")
+    telescope = read_telescope(telescope_path)
+    names = [n for n in settings.methods if not method(n).knows_field]
+    settings = settings.model_copy(update={"methods": names})
+    settings, methods, candidates = select_methods(settings, method_name)
+    files = ModelFiles(out, model_name((), name or telescope.name), methods)
+    with reserve_folder(files, [ImageInput(telescope_path)], page, overwrite):
+        source = simulate_stars(telescope, telescope_path, settings)
+        sentence = write_model(settings, [source], files, licence, candidates, page)
+    print(sentence)
+    words = ["psfdae", "predict", "IMAGE", "--detect", "--model", str(files.bundle)]
+    print(f"next: {shlex.join([*words, '--out', str(out / 'psf.fits')])}")
     return sentence
 
 

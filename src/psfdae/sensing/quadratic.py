@@ -14,11 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_LEADING = 9
+MAX_LEADING = 21
 """Number of parameters whose products are terms of an image; it is linear in the others."""
-
-DESIGN = 70
-"""Pairs of opposite places at which images are computed for a fit."""
 
 
 def quadratic_terms(place: np.ndarray) -> np.ndarray:
@@ -30,11 +27,13 @@ def quadratic_terms(place: np.ndarray) -> np.ndarray:
 
 
 def draw_design(size: int, rng: np.random.Generator) -> np.ndarray:
-    """Return places (2 × `DESIGN`, D) from a standard normal, each with its opposite.
+    """Return places (n, D) from a standard normal, each with its opposite.
 
-    Terms of odd order then do not disturb the fit of even ones.
+    Terms of odd order then do not disturb the fit of even ones, of which there are two for three
+    pairs.
     """
-    half = rng.standard_normal((DESIGN, size))
+    leading = min(size, MAX_LEADING)
+    half = rng.standard_normal((3 * (1 + leading * (leading + 1) // 2) // 2, size))
     return np.concatenate([half, -half])
 
 

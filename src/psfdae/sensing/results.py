@@ -24,9 +24,6 @@ from psfdae.sensing.summary import nearest_modes, summarise_modes
 from psfdae.telescope.field import Terms, build_terms, model_telescope
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 
-IMAGES = slice(None, None, 3)
-"""Draws whose images are averaged: of 100, the mean errs by a tenth of its standard deviation."""
-
 
 @check_arguments
 def wavefront(
@@ -313,8 +310,8 @@ class Wavefronts:
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
         # The star is in the middle: its position is not part of the PSF.
-        centre_px = np.zeros((self.draws[:, IMAGES].shape[1], 2))
-        # Mean and scatter over the PSFs of draws, star by star, because the images of all stars
+        centre_px = np.zeros((self.draws.shape[1], 2))
+        # Mean and scatter over the PSFs of all draws, star by star, because the images of all stars
         # would not fit into the memory.
         mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
@@ -330,11 +327,11 @@ class Wavefronts:
         k = len(self.terms.names)
         model = np.full(self.stamps.data.shape, np.nan)
         for row, star in enumerate(self.star):
-            place, flux = np.split(self.draws[row, IMAGES, k : k + 3], [2], axis=1)
+            place, flux = self.draws[row, :, k : k + 2], self.draws[row, :, k + 2]
             images = self.search.optics.operator.stamps(self._pupil_modes(row, place))
             # Fluxes of the draws, from units of the search to electrons to the stamps' unit.
             light = self.search.flux[star] * flux / self.search.photons.gain[star]
-            model[star] = (light[:, :, None] * images).mean(axis=0)
+            model[star] = (light[:, None, None] * images).mean(axis=0)
         return model
 
     @property
@@ -345,9 +342,9 @@ class Wavefronts:
         return np.where(is_unused, np.nan, self.stamps.data - sky - self.model)
 
     def _pupil_modes(self, row: int, place_px: np.ndarray) -> np.ndarray:
-        """Return mode coefficients of the draws `IMAGES` of `star[row]` at positions, (s, 2)."""
-        stars, coefficients = np.full(len(place_px), self.star[row]), self.coefficients[row, IMAGES]
-        return self.search.optics.mode_coefficients(stars, coefficients, place_px)
+        """Return mode coefficients (s, J + 2) of the draws of `star[row]` at positions (s, 2)."""
+        stars = np.full(len(place_px), self.star[row])
+        return self.search.optics.mode_coefficients(stars, self.coefficients[row], place_px)
 
     @property
     def snr(self) -> np.ndarray:

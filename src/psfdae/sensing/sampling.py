@@ -139,10 +139,11 @@ def sample_around(
         weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
         rows = group_by_posterior(to_parameters(places), part.size)
         indices = [choose_evenly(*pair) for pair in zip(weight, chain_rngs, strict=True)]
-        mode_places = {
-            number: CHAINS.reference_scale * places[:, chain_mode == number].reshape(-1, size)
-            for number in np.unique(chain_mode)
-        }
+        mode_places = {}
+        for number in np.unique(chain_mode):
+            mode_place = CHAINS.reference_scale * places[:, chain_mode == number].reshape(-1, size)
+            earlier_places = fit_places.get(number, mode_place[:0])
+            mode_places[number] = np.concatenate([earlier_places, mode_place])
         effective = weight.mean(axis=1) ** 2 / (weight**2).mean(axis=1)
         return (
             np.take_along_axis(rows, np.array(indices)[..., None], axis=1),
@@ -150,10 +151,10 @@ def sample_around(
             mode_places,
         )
 
-    # Where the approximation is poor, chains follow one that is fitted to their draws, too; where
-    # even this is poor, the posterior.
+    # Where the approximation is poor, chains follow one that is fitted to their draws, too, at most
+    # twice; where even this is poor, the posterior.
     draws, effective, places = follow(np.arange(posteriors), None if approximate is None else {})
-    for is_last in (False, True):
+    for is_last in (False, False, True):
         poor = np.flatnonzero(effective < CHAINS.min_effective)
         if poor.size:
             draws[poor], effective[poor], places = follow(poor, None if is_last else places)
