@@ -286,6 +286,32 @@ def test_a_full_disk_at_any_output_is_one_line(inputs, expected):
     assert number > 1
 
 
+@pytest.mark.parametrize("expected", ["photometry", "predict", "psf"], indirect=True)
+def test_an_interrupt_at_any_output_leaves_all_earlier_files_or_all_new_ones(inputs, expected):
+    """Ctrl-C before a file is on the disk or has its name, of a command that replaces its files."""
+    (words, whole), out = expected, inputs / "out"
+    earlier = dict.fromkeys(whole, b"earlier")
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    outcomes = set()
+    for number in range(1, 200):
+        for name, content in earlier.items():
+            (out / name).write_bytes(content)
+        with pytest.MonkeyPatch.context() as patch:
+            count = events(patch, number, interrupt, (Path, "replace"))
+            result = psfdae(*words, "--overwrite")
+        left = contents(out)
+        assert left in (earlier, whole) and not [*out.rglob("*.tmp")], number
+        if count() < number:
+            break
+        assert result.exit_code == 1
+        outcomes.add(left == whole)
+    assert result.exit_code == 0
+    assert outcomes == ({False, True} if len(whole) > 1 else {False})
+
+
 @pytest.mark.parametrize("step", ["fit_method", "pack_model", "validate"])
 def test_a_training_that_is_interrupted_leaves_nothing(inputs, monkeypatch, step):
     """Ctrl-C at any step removes the files that the run has written, and no others."""

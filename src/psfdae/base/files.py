@@ -105,9 +105,19 @@ def rename_together(main: Path) -> Iterator[None]:
     token = _pending_renames.set(renames)
     try:
         yield
-        # The content of each file is on the disk already: renames need no space.
-        for temporary, path in sorted(renames, key=lambda pair: pair[1] == main):
-            temporary.replace(path)
+        # The content of each file is on the disk already: renames need no space. Ctrl-C comes after
+        # them, so that new files never lie beside earlier ones.
+        pending, interrupt = sorted(renames, key=lambda pair: pair[1] == main), None
+        while pending:
+            try:
+                temporary, path = pending[0]
+                if temporary.exists():  # else it was renamed just before the interrupt
+                    temporary.replace(path)
+                del pending[0]
+            except KeyboardInterrupt as error:
+                interrupt = error
+        if interrupt is not None:
+            raise interrupt
     finally:
         _pending_renames.reset(token)
         for temporary, _ in renames:

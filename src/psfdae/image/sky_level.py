@@ -386,7 +386,7 @@ def measure_meshes(
     if not is_known.any():
         raise ValueError(f"no mesh of {mesh_px} px has enough good pixels")
     if not is_known.all():
-        nearest = min(10, np.count_nonzero(is_known))
+        nearest = min(10, int(np.count_nonzero(is_known)))
         tree = cKDTree(np.argwhere(is_known))
         distance, index = tree.query(np.argwhere(~is_known), k=range(1, nearest + 1))
         for values in (level, noise):

@@ -28,7 +28,7 @@ from psfdae.photometry.photon_noise import pixel_error
 from psfdae.photometry.wings_fit import StarFluxes, add_model_errors, around_stars
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs, aperture_correction
-from psfdae.psf.wings import Wings, choose_wings, outer_shares
+from psfdae.psf.wings import Wings, choose_wings
 from psfdae.stars.moments import robust_scatter
 
 MAX_CHI2_RATIO = 2.5
@@ -222,7 +222,7 @@ def photometry(
     light_error = area_px * map_coordinates(
         halo_error, np.nan_to_num(fit.place[:, ::-1]).T, order=1, mode="nearest"
     )
-    stars = tabulate_stars(model, observation, fit, origin, wings_used, fwhm, light_error)
+    stars = tabulate_stars(model, psfs, observation, fit, origin, wings_used, fwhm, light_error)
     stars["flags"] |= star_flags(stars, bad & ~is_saturated, is_saturated, box_px, fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
@@ -322,6 +322,7 @@ def find_duplicates(
 
 def tabulate_stars(
     model: FieldPsfs,
+    psfs: PsfGrid,
     observation: Image,
     fit: JointFit,
     origin: np.ndarray,
@@ -335,6 +336,8 @@ def tabulate_stars(
     ----------
     model : FieldPsfs
         Model of the PSFs, with their errors.
+    psfs : PsfGrid
+        Its PSFs, for fluxes in the unit of the fit.
     observation : Image
         The image with its stars.
     fit : JointFit
@@ -350,13 +353,12 @@ def tabulate_stars(
     """
     from astropy.table import Table
 
-    # Ratio of all light of a star to its light in the model.
+    # Ratio of all light of a star to its light in the model, also of a star whose flux came out
+    # negative: its PSF is known from its position.
     total_ratio, ratio_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
-        flux = fit.flux / observation.unit_factor
-        total_ratio, ratio_error = wings.total_over_flux(
-            outer_shares(model.draw_on_pixels, fit.place, flux)
-        )
+        shares = psfs.outer_shares(fit.place, fit.flux, model.stamp_px)
+        total_ratio, ratio_error = wings.total_over_flux(shares)
     is_detected = observation.detections is not None
     # A centre that follows noise makes a detected star too bright (`JointFit.flux_bias`). With a
     # list, the errors of stars that overlap are larger than this bias, and of either sign.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfdae.base.errors import Error, keyword, warn
+from psfdae.base.progress import task
 from psfdae.base.types import WCS, CCDData, QTable, Table
 from psfdae.denoise.image_prediction import CAUSES
 from psfdae.image.catalogue import StarList, as_catalogue
@@ -119,24 +120,28 @@ def measure_all_stars(
     # The model must know the PSF at every place (`field_range` rejects others), and have pixels
     # as large as the image's.
     model.field_range()
-    observation = opened or open_observation(source, model.stamp_px).assume_scale()
-    if not isinstance(observation, Image):
-        raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
-    model.check_scale(observation.pixel_scale_arcsec, str(source.path))
-    # The image may show another part of the detector than the training.
-    model, frame_notes = model.to_image_frame(observation)
-    # Read the stars of the reference before the long work, in case they cannot be used.
-    magnitudes = scatter = None
-    if reference is not None:
-        stars = replace(source, catalogue=reference, origin=origin, detect=False, on_image=False)
-        positions = open_observation(stars, model.stamp_px).positions
-        assert positions is not None  # of an image
-        star_list = as_catalogue(reference)
-        magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
-
-    # All stars of the image, and the zero point by those that the reference has.
-    observation = add_measured_gain(model, observation)
-    star_fit, list_note = measure_stars(model, observation, source.given_threshold)
+    # Progress is shown from here on: an image may take long to be opened.
+    with task("photometry", 2) as advance:
+        observation = opened or open_observation(source, model.stamp_px).assume_scale()
+        advance(1, "image")
+        if not isinstance(observation, Image):
+            raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
+        model.check_scale(observation.pixel_scale_arcsec, str(source.path))
+        # The image may show another part of the detector than the training.
+        model, frame_notes = model.to_image_frame(observation)
+        # Read the stars of the reference before the long work, in case they cannot be used.
+        magnitudes = scatter = None
+        if reference is not None:
+            stars = replace(
+                source, catalogue=reference, origin=origin, detect=False, on_image=False
+            )
+            positions = open_observation(stars, model.stamp_px).positions
+            assert positions is not None  # of an image
+            star_list = as_catalogue(reference)
+            magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
+        # All stars of the image, and the zero point by those that the reference has.
+        observation = add_measured_gain(model, observation)
+        star_fit, list_note = measure_stars(model, observation, source.given_threshold)
     zero_point_note = None
     if magnitudes is not None:
         zero_point, scatter, zero_point_note = measure_zero_point(star_fit, *magnitudes)

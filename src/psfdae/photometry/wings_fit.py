@@ -61,10 +61,13 @@ def tabulate_tents(wings: Wings) -> np.ndarray:
     return np.ascontiguousarray(heights.T)
 
 
-def select_lit_stars(stars: StarFluxes, wings: Wings) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (m, 2) and F s (m,) of the 1000 stars of the brightest wings.
+def select_lit_stars(
+    stars: StarFluxes, wings: Wings, share: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (m, 2) and F s (m,) of the 1000 stars of the brightest wings, or fewer.
 
-    In a crowded image, these have most of the light of all wings.
+    In a crowded image, these have most of the light of all wings. The brightest ones that have
+    a `share` of Σ (F s)² are enough.
     """
     # F s, the factor of all tents of a star.
     scaled_flux = stars.flux * wings.scale(stars.outer_share)
@@ -72,7 +75,9 @@ def select_lit_stars(stars: StarFluxes, wings: Wings) -> tuple[np.ndarray, np.nd
     scaled_flux = np.where(np.isfinite(stars.outer_share), scaled_flux, np.nan)
     is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.place).all(axis=1)
     lit_stars = np.flatnonzero(is_lit)
-    brightest = lit_stars[np.argsort(-scaled_flux[lit_stars])[:1000]]
+    brightest = lit_stars[np.argsort(-scaled_flux[lit_stars], kind="stable")[:1000]]
+    information = np.cumsum(np.square(scaled_flux[brightest]))
+    brightest = brightest[: 1 + np.searchsorted(information, share * information[-1:])[:1].sum()]
     return stars.place[brightest], scaled_flux[brightest]
 
 
@@ -113,9 +118,10 @@ def draw_tents(
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
     """Yield tiles of an image (h, w), and Σ F s h_k of the stars in them, shape (K, rows, columns).
 
-    The shape of tiles that no wings reach is (0, rows, columns).
+    The shape of tiles that no wings reach is (0, rows, columns). Faint stars, which have 0.2 % of
+    Σ (F s)², tell next to nothing of the wings, and are left out.
     """
-    heights, (positions, scaled_flux) = tabulate_tents(wings), select_lit_stars(stars, wings)
+    heights, (positions, scaled_flux) = tabulate_tents(wings), select_lit_stars(stars, wings, 0.998)
     # The tents of a whole image would take K times its memory.
     height, width = shape
     for top in steps("wings", range(0, height, tile_px)):
@@ -278,7 +284,8 @@ def sum_products(
         # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves
         # there, and p_0 times the area of the stamp the light that it lacks, as an aperture would
         # find it. So σ² is averaged over a stamp, also across the edge of the tile.
-        around = tuple(slice(max(s.start - stamp_px, 0), s.stop + stamp_px) for s in tile)
+        margin = stamp_px // 2 + 1
+        around = tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in tile)
         inner = tuple(
             slice(s.start - a.start, s.stop - a.start) for s, a in zip(tile, around, strict=True)
         )
@@ -288,25 +295,27 @@ def sum_products(
         smooth_variance = np.maximum(smooth_variance, variance.min())
         # Undetected stars and galaxies are left out.
         is_used = ~bad[tile] & (np.abs(residual[tile]) < limit * sigma[tile])
-        weight = np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0)
-        columns = [tile_tents, np.ones((1, *weight.shape)), residual[tile][None]]
-        design = np.concatenate(columns) * weight
-        # Of a tile without wings, the design has only the even light.
-        flat = design.reshape(len(design), -1)
-        products, rows = flat @ flat.T, np.s_[count + 2 - len(design) : count + 1]
-        normal[rows, rows] += products[:-1, :-1]
-        projection[rows] += products[:-1, -1]
+        # Rows of the design of a tile: tents, if wings reach it, the even light, the data, and the
+        # number of the pixels. Their sums are small enough for single precision.
+        design = np.empty((len(tile_tents) + 3, *is_used.shape), np.float32)
+        design[:-3], design[-3], design[-2] = tile_tents, 1.0, residual[tile]
+        design[:-1] *= np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0).astype(np.float32)
+        design[-1] = is_used
+        flat, first = design[:-1].reshape(len(design) - 1, -1), count - len(tile_tents)
+        products = flat @ flat.T
+        normal[first:, first:] += products[:-1, :-1]
+        projection[first:] += products[:-1, -1]
         square += float(products[-1, -1])
         pixels += int(np.count_nonzero(is_used))
         # Sums over blocks are products with matrices of 0 and 1. Blocks at the lower and right
         # edges may be smaller.
         down, across = (
-            np.equal.outer(np.arange(-(-size // stamp_px)), np.arange(size) // stamp_px) * 1.0
-            for size in weight.shape
+            np.equal.outer(np.arange(-(-size // stamp_px)), np.arange(size) // stamp_px)
+            for size in is_used.shape
         )
-        sums = down @ np.concatenate([design, [is_used]]) @ across.T
+        sums = down.astype(np.float32) @ (design @ across.T.astype(np.float32))
         block = np.zeros((count + 3, sums[0].size))
-        block[count + 2 - len(design) :] = sums.reshape(len(sums), -1)
+        block[first:] = sums.reshape(len(sums), -1)
         blocks.append(block)
     return Products(normal, projection, square, pixels, np.concatenate(blocks, axis=1))
 

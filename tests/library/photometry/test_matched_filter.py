@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 import psfdae
+from psfdae.base import progress
 from psfdae.image.image_input import ImageInput
+from psfdae.photometry import image_photometry
 from psfdae.photometry.image_photometry import measure_all_stars
 from psfdae.photometry.matched_filter import find_stars, measure_snr
 from psfdae.psf.grid import PsfGrid
+from psfdae.psf.wings import outer_shares
 from simulated_fields import CAMERA, TrueField, compare, false_share, simulate_field
 
 SIZE = 200
@@ -131,6 +136,35 @@ def test_the_threshold_has_a_default_for_each_search(tmp_path):
 
 
 FWHM_PX = 3.0, 3.65
+
+
+def test_progress_begins_before_the_image_is_opened(monkeypatch):
+    shown = []
+
+    @contextmanager
+    def display(name):
+        shown.append(name)
+        yield lambda fraction, text: None
+
+    def interrupt(*_):
+        assert shown == ["photometry"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(image_photometry, "open_observation", interrupt)
+    with progress.use_display(display), pytest.raises(KeyboardInterrupt):
+        measure_all_stars(TrueField(200, FWHM_PX), ImageInput(np.zeros((9, 9)), detect=True))
+
+
+def test_the_outer_share_of_a_star_is_known_from_its_position_whatever_its_flux():
+    """Of the PSF there, as the model draws it; only a position that is not known has none."""
+    model, place = TrueField(200, (2.5, 4.5)), np.random.default_rng(3).uniform(20, 180, (9, 2))
+    expected = outer_shares(model.draw_on_pixels, place)
+    place = np.vstack([place, [np.nan, 5.0]])
+    grid = PsfGrid.sample(model)
+    for flux in (1e4, -3.0, 0.0, np.nan):
+        shares = grid.outer_shares(place, np.full(10, flux), model.stamp_px)
+        assert shares[:9] == pytest.approx(expected, rel=0.03) and np.isnan(shares[9])
+    assert np.ptp(expected) > 0.3 * expected.mean()
 
 
 def test_faint_stars_of_a_crowded_field_are_found():
