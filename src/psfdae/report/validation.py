@@ -16,7 +16,7 @@ from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import rows_to_table, set_format
 from psfdae.methods import method as method_of
-from psfdae.methods.interface import Method
+from psfdae.methods.interface import Estimate, Method
 from psfdae.methods.metrics import all_metrics, quality, summarise_metrics
 from psfdae.psf.interface import PredictionError
 from psfdae.report.checks import (
@@ -139,8 +139,11 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
         row = {**key, "method": MEAN_PSF, "noise_level": level}
         mean_rows += summarise_metrics(row, all_metrics(by_mean_psf, truth, data_range), star)
         for name, method in methods.items():
-            scale = level_scale(model, stars, name)
-            estimate = method.estimate(noisy, scale * level, position)
+            # The estimate of the packing, if the model was packed from these stars.
+            packed_method, estimate = stars.estimates.get(level, (None, Estimate(noisy)))
+            if method is not packed_method:
+                scale = level_scale(model, stars, name)
+                estimate = method.estimate(noisy, scale * level, position)
             # Metrics of every image; their means and standard errors are clustered by star.
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}

@@ -181,7 +181,14 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
     description = describe_settings(stars, type(method_fit))
     with fix_threads(settings.evaluation.threads):
         model = build_model(
-            method_fit, stars.product, ImageStars.reference, settings, description, name, licence
+            method_fit,
+            stars.product,
+            ImageStars.reference,
+            settings,
+            description,
+            name,
+            licence,
+            estimates=stars.estimates,
         )
         if not method_fit.knows_field:
             return model

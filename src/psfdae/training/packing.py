@@ -23,7 +23,7 @@ from psfdae.denoise.error_model import ErrorModel
 from psfdae.denoise.flux_model import FluxModel, signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.methods.bundle_info import BundleInfo
-from psfdae.methods.interface import Method
+from psfdae.methods.interface import Estimate, Method
 from psfdae.methods.metrics import all_metrics
 from psfdae.psf.wings import Wings
 from psfdae.training.calibration import (
@@ -44,6 +44,7 @@ def build_model(
     name: str,
     licence: str,
     largest_mb: float | None = None,
+    estimates: dict[float, tuple[Method, Estimate]] | None = None,
 ) -> StarModel:
     """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
 
@@ -63,6 +64,8 @@ def build_model(
         Name and licence of the model.
     largest_mb : float, optional
         Size of the arrays, for which a mixture leaves out fine axes.
+    estimates : dict, optional
+        Receives the model's method and its estimate of the noisy test stars by noise level λ.
 
     Raises
     ------
@@ -82,7 +85,10 @@ def build_model(
     )
     area, data_range = bundle.info.noise_equivalent_px, config.evaluation.data_range
     held_out = model_stars.held_out
-    metrics = metrics_by_level(model.method, held_out, noisy, star_errors, area, data_range)
+    estimates = {} if estimates is None else estimates
+    metrics = metrics_by_level(
+        model.method, held_out, noisy, star_errors, area, data_range, estimates
+    )
     # The model as it is written: with errors, and a description that has them.
     settings = {**bundle.info.config, "evaluation": config.evaluation.model_dump()}
     info = bundle.info.model_copy(update={"metrics": metrics, "config": settings})
@@ -260,6 +266,7 @@ def metrics_by_level(
     errors: StarErrors,
     area: float,
     data_range: float,
+    estimates: dict[float, tuple[Method, Estimate]],
 ) -> list[dict[str, float]]:
     """Measure errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
 
@@ -277,6 +284,8 @@ def metrics_by_level(
         Noise-equivalent area of a typical star, in pixels.
     data_range : float
         Range of values of the metrics (`psfdae.methods.metrics.all_metrics`).
+    estimates : dict
+        Receives the method and its estimate by λ.
 
     Returns
     -------
@@ -290,6 +299,7 @@ def metrics_by_level(
             stars.noise.kappa * level,
             method_fit.estimate(images, level, stars.position),
         )
+        estimates[level] = method_fit, estimate
         # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(

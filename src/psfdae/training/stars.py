@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -23,7 +23,7 @@ from psfdae.image.positions import list_offset
 from psfdae.image.selection import Candidates
 from psfdae.image.selection_advice import advice
 from psfdae.image.tables import html_table, star_table
-from psfdae.methods.interface import Method, TrainingSet
+from psfdae.methods.interface import Estimate, Method, TrainingSet
 from psfdae.stars.bright_stars import BrightStars
 from psfdae.stars.splits import Split, held_out_fields
 from psfdae.training.settings import Settings
@@ -53,6 +53,9 @@ class ImageStars:
         Facts about the camera and the list, and advice on settings.
     exposures : sequence of ImageStars
         The stars of each image, if there are several.
+    estimates : dict
+        By noise level λ, the method of the model that was packed last, and its estimate of the
+        noisy test images, which the report shows.
 
     Examples
     --------
@@ -70,6 +73,7 @@ class ImageStars:
     settings: Settings
     notes: Sequence[str]
     exposures: Sequence[ImageStars] = ()
+    estimates: dict[float, tuple[Method, Estimate]] = field(default_factory=dict)
     split_kind: ClassVar[str] = "held_out"
     """Kind of the split: all images of a star are in the training, or all are in the test."""
     reference: ClassVar[str] = "realisation"

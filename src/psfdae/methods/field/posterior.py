@@ -195,14 +195,15 @@ def match_flux(prior: FieldPrior, stars: FieldStamps) -> tuple[np.ndarray, np.nd
     variance = stars.noise[:, None] ** 2
     score = gain / variance + stars.log_prior
     rows, best_node = np.arange(len(flux)), score.argmax(axis=1)
-    # The filter ignores residuals of bright stars: scores are softened as if the S/N were at most
-    # 30. Nodes more than 8 below the best, in ln, would have a weight below e⁻⁸, less than
-    # `mixing_weights` drops; the number of nodes has limits on both sides.
-    soft_score = gain / (variance + flux**2 * square / 30.0**2) + stars.log_prior
+    # The filter ignores residuals of bright stars: scores are softened as if the S/N in the best
+    # node were at most 30. Nodes more than 9 below the best, in ln, have a weight of about e⁻⁹: all
+    # together change ln of the evidence by about 1e-3. Their number has limits on both sides.
+    best_square = (flux**2 * square)[rows, best_node, None]
+    soft_score = gain / (variance + best_square / 30.0**2) + stars.log_prior
     limits = prior.limits.min_nodes, round(prior.limits.max_node_area_px2 / prior.step_px**2)
     fewest, largest = (min(count, score.shape[1]) - 1 for count in limits)
     highest = -np.partition(-soft_score, [fewest, largest], axis=1)
-    threshold = np.clip(soft_score.max(axis=1) - 8.0, highest[:, largest], highest[:, fewest])
+    threshold = np.clip(soft_score.max(axis=1) - 9.0, highest[:, largest], highest[:, fewest])
     is_nearby = np.isfinite(score) & (soft_score >= threshold[:, None])
     is_nearby[rows, best_node] = True
     return flux[rows, best_node], is_nearby, 1.0 / np.sqrt(square[best_node])
