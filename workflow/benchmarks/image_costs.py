@@ -164,7 +164,8 @@ def compare_tools(image, against, fields, growth, results):
                 write_csv(results / "tables/benchmark_images.csv", table)
             shutil.rmtree(folder)
     wide = table.pivot_table("cpu_s", ["image", "step"], "tool", sort=False).reindex(columns=trees)
-    print("CPU time over the earlier commit's:", (wide.psfdae / wide.iloc[:, 1]).dropna(), sep="\n")
+    ratios = (wide.psfdae / wide.iloc[:, 1]).dropna().round(2)
+    print("CPU time over the earlier commit's:", ratios.to_string(), sep="\n")
     if fields + growth:
         write_png(apply_style(image_growth)(table), results / "figures/benchmark/images.png")
     if failures:
