@@ -14,15 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_LEADING = 21
-"""Number of parameters whose products are terms of an image; it is linear in the others."""
+MAX_PARAMETERS = 21
+"""Largest number of parameters: more have too many products for a fit to pay."""
 
 
 def quadratic_terms(place: np.ndarray) -> np.ndarray:
-    """Return 1, x_i, and products x_i x_k of the leading components of places (m, D), (m, Q)."""
-    leading = place[:, :MAX_LEADING].T
-    rows, columns = np.triu_indices(len(leading))
-    products = leading[rows] * leading[columns]
+    """Return 1, x_i, and all products x_i x_k of the components of places (m, D), (m, Q)."""
+    rows, columns = np.triu_indices(place.shape[1])
+    products = place.T[rows] * place.T[columns]
     return np.concatenate([np.ones((1, len(place))), place.T, products]).T
 
 
@@ -32,32 +31,8 @@ def draw_design(size: int, rng: np.random.Generator) -> np.ndarray:
     Terms of odd order then do not disturb the fit of even ones, of which there are two for three
     pairs.
     """
-    leading = min(size, MAX_LEADING)
-    half = rng.standard_normal((3 * (1 + leading * (leading + 1) // 2) // 2, size))
+    half = rng.standard_normal((3 * (1 + size * (size + 1) // 2) // 2, size))
     return np.concatenate([half, -half])
-
-
-def rotate_factor(factor: np.ndarray, prior_precision: np.ndarray) -> np.ndarray:
-    """Rotate a factor of a covariance so that the parameters best known from the image come first.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (D + 2, D + 2)
-        Lower triangular factor of the covariance; the last two parameters are flux and sky.
-    prior_precision : ndarray, shape (D,)
-        Inverse variance of the prior of the others.
-
-    Returns
-    -------
-    ndarray, shape (D + 2, D + 2)
-        Another factor of the same covariance; the others still depend on D components alone.
-    """
-    # In units of the factor, posterior information is 1 = prior + image. The eigenvectors with the
-    # least information from the prior have most from the image.
-    shape = factor[:-2, :-2]
-    rotation = np.eye(len(factor))
-    rotation[:-2, :-2] = np.linalg.eigh((shape.T * prior_precision) @ shape)[1]
-    return np.asarray(factor @ rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +42,8 @@ class QuadraticPosterior:
     Attributes
     ----------
     mean, factor : ndarray, shapes (M, D + 2) and (M, D + 2, D + 2)
-        Parameters are mean + factor · x at the place x.
+        Parameters are mean + factor · x at the place x. The factor is lower triangular; flux and
+        sky, the last two parameters, do not change the image.
     prior_precision : ndarray, shape (D + 2,)
         Inverse variance of the prior of the parameters.
     root : mapping of int to ndarray, shape (R, Q + 2)

@@ -37,10 +37,10 @@ from psfdae.sensing.climbing import (
 )
 from psfdae.sensing.modes import merge_modes
 from psfdae.sensing.quadratic import (
+    MAX_PARAMETERS,
     QuadraticPosterior,
     draw_design,
     fit_root,
-    rotate_factor,
 )
 from psfdae.sensing.sampling import sample_around
 from psfdae.stars.bright_stars import BrightStars
@@ -515,12 +515,10 @@ class WavefrontSearch:
         # A random stream for each star: its draws do not depend on other stars.
         owner = np.searchsorted(stars, modes.star)
         rngs = [stream(self.seed, "wavefront draws", int(star)) for star in stars]
-        precision = self.prior_precision[: k + 2]
-        factor = np.array(
-            [rotate_factor(c, precision) for c in np.linalg.cholesky(modes.covariance)]
-        )
+        factor = np.linalg.cholesky(modes.covariance)
         mixture = modes.parameters, factor, modes.evidence
-        return sample_around(log_posterior, twin, owner, *mixture, rngs, approximate)
+        approximation = approximate if k + 2 <= MAX_PARAMETERS else None
+        return sample_around(log_posterior, twin, owner, *mixture, rngs, approximation)
 
     def predict_counts(
         self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, star_parameters: np.ndarray

@@ -23,7 +23,7 @@ from psfdae.sensing.climbing import Steps, add_normal_prior, climb, poisson_info
 from psfdae.sensing.joint import TelescopePosterior, twin_numbers
 from psfdae.sensing.modes import compute_squared_distance, merge_modes
 from psfdae.sensing.plot import bright_separate_stars
-from psfdae.sensing.quadratic import QuadraticPosterior, draw_design, fit_root, rotate_factor
+from psfdae.sensing.quadratic import QuadraticPosterior, draw_design, fit_root
 from psfdae.sensing.results import build_stamps
 from psfdae.sensing.sampling import choose_evenly, sample_around
 from psfdae.sensing.stars import Photons, SensingError, StarOptics
@@ -221,7 +221,7 @@ def test_quadratic_images_give_the_posterior_of_counts_with_their_variance_at_th
     rng, sky, unit = np.random.default_rng(2), 50.0, 1000.0
     linear, square = rng.normal(0.0, 0.01, (2, 3, 20))
     mean = np.array([0.3, -0.2, 0.1, 1.1, 0.4])
-    factor = rotate_factor(np.tril(rng.uniform(0.2, 0.5, (5, 5))), np.full(3, 0.5))
+    factor = np.tril(rng.uniform(0.2, 0.5, (5, 5)))
     precision = np.array([1.0, 1.0, 1.0, 0.0, 0.0])
 
     def image(shape):
@@ -240,15 +240,6 @@ def test_quadratic_images_give_the_posterior_of_counts_with_their_variance_at_th
     chi2 = np.nansum((counts - expected) ** 2 / variance, axis=1)
     height = posterior(np.zeros(40, int), place)
     assert height == pytest.approx(-0.5 * (chi2 + at**2 @ precision), rel=1e-4)
-
-
-def test_rotation_of_a_factor_keeps_the_covariance_and_sorts_by_what_the_image_knows():
-    factor = np.linalg.cholesky(np.diag([0.9, 0.01, 0.4, 2.0, 3.0]) + 0.01)
-    rotated = rotate_factor(factor, np.ones(3))
-    assert rotated @ rotated.T == pytest.approx(factor @ factor.T)
-    assert rotated[:3, 3:] == pytest.approx(0.0)
-    # The image knows the second parameter best: its posterior is the narrowest.
-    assert np.abs(rotated[:3, :3]).argmax(axis=0).tolist() == [1, 2, 0]
 
 
 def test_climbs_that_meet_are_one():
