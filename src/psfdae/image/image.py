@@ -125,6 +125,12 @@ class Image(Observation):
         """
         return self.cache.sky or self.cache.keep_sky(self._measure_sky())
 
+    def take_sky(self) -> Sky:
+        """Return `sky`, and keep it no longer: of a large image, its maps take much memory."""
+        sky = self.sky()
+        self.cache.sky = None
+        return sky
+
     def _measure_sky(self) -> Sky:
         """Measure the sky without bad pixels; its noise is a map of σ, scaled, if there is one."""
         image, is_masked, sigma = self._read()

@@ -138,15 +138,17 @@ def level_and_noise(
     meshes, and the part is 0, unless the sky is known to have fine structure, or over 5 % of the
     image has structure that is not due to sources.
     """
-    # Each part between steps has meshes of its own. Single precision: of a large image, each map
-    # takes much memory.
-    level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
+    # Each part between steps has meshes of its own.
     rows, columns, is_fine, _ = structure
-    for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
-        for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
-            part = np.s_[top:bottom, first:last]
-            if not bad[part].all() or not (rows or columns):
-                level[part], noise[part] = _measure_sky(image[part], bad[part], mesh_px)
+    if not (rows or columns):
+        level, noise = _measure_sky(image, bad, mesh_px)
+    else:
+        level, noise = (np.zeros(image.shape, np.float32) for _ in range(2))
+        for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
+            for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
+                part = np.s_[top:bottom, first:last]
+                if not bad[part].all():
+                    level[part], noise[part] = _measure_sky(image[part], bad[part], mesh_px)
     # Structure that is finer than the meshes: σ of a mesh over σ from differences of neighbouring
     # pixels is larger there than elsewhere by a factor of 1.5; in resampled images it is larger
     # everywhere. Both change slowly: every fourth pixel is enough.
@@ -489,11 +491,8 @@ def _to_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
         )
         for pixels, count in zip(shape, coefficients.shape, strict=True)
     )
-    # A few rows at a time: products take twice the memory of the values.
-    rows, values = row_weights @ coefficients, np.empty(shape, np.float32)
-    for top in range(0, len(values), 64):
-        values[top : top + 64] = (column_weights @ rows[top : top + 64].T).T
-    return values
+    columns = (column_weights @ coefficients.T).T.astype(np.float32, order="C")
+    return np.asarray(row_weights.astype(np.float32) @ columns)
 
 
 # Structure within a mesh.

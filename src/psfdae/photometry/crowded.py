@@ -148,7 +148,7 @@ def photometry(
     middle_psf = model.psf_at(float(x), float(y), 1)
     area_px = float(1.0 / np.square(middle_psf).sum())  # noise-equivalent
     # The image with its sky; saturated pixels are not fitted.
-    sky = observation.sky()
+    sky = observation.take_sky()
     image = sky.signal + sky.level
     is_saturated = image >= saturate
     bad, cores = sky.bad | is_saturated, find_saturated_cores(is_saturated)

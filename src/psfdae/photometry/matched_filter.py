@@ -46,6 +46,7 @@ def find_stars(
     fwhm_px : float
         FWHM of the PSF, px. Stars are at least half of it apart, known ones included.
     """
+    from numpy.lib.stride_tricks import sliding_window_view
     from scipy.spatial import cKDTree
 
     # Tiles of one PSF and one scatter. Beyond 1.5 FWHM, a PSF adds little to S.
@@ -65,11 +66,14 @@ def find_stars(
             np.pad(image[first:end], pads, constant_values=outside)
             for image, outside in ((residual, 0.0), (sigma, np.inf))
         )
-        windows = [
-            np.stack([band[:, start : start + tile_px + 2 * margin] for start in columns])
+        # Views of all tiles, (tiles, rows, columns), without copies.
+        side = tile_px + 2 * margin
+        residual_tiles, sigma_tiles = (
+            sliding_window_view(band, side, axis=1)[:, ::tile_px][:, : len(columns)].swapaxes(0, 1)
             for band in bands
-        ]
-        snr, flux = measure_snr(*windows, psf.reshape(len(columns), 4, *psf.shape[1:]))
+        )
+        tile_psfs = psf.reshape(len(columns), 4, *psf.shape[1:])
+        snr, flux = measure_snr(residual_tiles, sigma_tiles, tile_psfs)
         # Local maxima among all half pixels of the tile; a pixel more surrounds it.
         tile, row, column = np.nonzero(snr[:, 2:-2, 2:-2] > threshold)
         around = np.ix_([1, 2, 3], [1, 2, 3])

@@ -289,7 +289,7 @@ def sum_products(
         inner = tuple(
             slice(s.start - a.start, s.stop - a.start) for s, a in zip(tile, around, strict=True)
         )
-        variance = np.square(sigma[around], dtype=np.float64)
+        variance = np.square(sigma[around])
         smooth_variance = uniform_filter(variance, stamp_px, mode="nearest")[inner]
         # A mean is not below the least value, but for the rounding of running sums.
         smooth_variance = np.maximum(smooth_variance, variance.min())
@@ -299,7 +299,7 @@ def sum_products(
         # number of the pixels. Their sums are small enough for single precision.
         design = np.empty((len(tile_tents) + 3, *is_used.shape), np.float32)
         design[:-3], design[-3], design[-2] = tile_tents, 1.0, residual[tile]
-        design[:-1] *= np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0).astype(np.float32)
+        design[:-1] *= np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0)
         design[-1] = is_used
         flat, first = design[:-1].reshape(len(design) - 1, -1), count - len(tile_tents)
         products = flat @ flat.T
@@ -383,8 +383,10 @@ def around_stars(
     # Each turn finds the sky without the wings so far, of the same structure, then the wings on
     # this sky. The sky of the last turn is off by far less than the error of the wings.
     for _ in steps("light beyond the stamps", range(8)):
-        residual = without_stars - draw_wings(image.shape, stars, wings)
-        known_sky = measure_sky(np.where(bad, 0.0, residual), bad, sky.structure)
+        residual = draw_wings(image.shape, stars, wings)
+        np.subtract(without_stars, residual, out=residual)
+        residual[bad] = 0.0
+        known_sky = measure_sky(residual, bad, sky.structure)
         if not with_wings:
             break
         residual -= known_sky.level
@@ -399,6 +401,7 @@ def around_stars(
         light, light_sigma = wings.light()
         if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
             break
+    del residual  # of a large image, each map takes much memory
     wing_light = draw_wings(image.shape, stars, wings)
     without_stars -= wing_light
     # Sky and signal without the wings, with the noise map if the image has one.
@@ -446,7 +449,8 @@ def is_like_psf(
     is_good = is_inside & ~bad[at]
     count = np.count_nonzero(is_good, axis=(1, 2))
     square = np.square(residual[at] / sigma[at]).sum(axis=(1, 2), where=is_good)
-    return is_inside[:, 2, 2] & (count > 0.5 * axis.size**2) & (square < 4.0 * count)
+    is_fitted = (count > 0.5 * axis.size**2) & (square < 4.0 * count)
+    return np.asarray(is_inside[:, 2, 2] & is_fitted)
 
 
 def subtract_halos(

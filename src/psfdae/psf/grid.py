@@ -92,15 +92,14 @@ class PsfGrid:
         They are the means of the splines of the nodes around each star, and of three magnitudes if
         the grid has these; for `flux` see `stamps`.
         """
+        from scipy.sparse import csr_array
+
         node, share = self._nodes(centre, np.full(len(centre), np.nan) if flux is None else flux)
-        flat = self.splines.reshape(len(self.splines), -1)
-        mean_spline = np.empty((len(centre), flat.shape[1]), np.float32)
-        share = share.astype(np.float32)
-        # Batches with 2^21 coefficients of nodes, for memory.
-        count = node.size * flat.shape[1] // 2**21 + 1
-        for batch in np.array_split(np.arange(len(centre)), count):
-            mean_spline[batch] = (share[batch, None] @ flat[node[batch]])[:, 0]
-        return mean_spline.reshape(len(centre), *self.splines.shape[1:])
+        # A product with a sparse matrix, whose rows have the weights of the nodes.
+        ends, size = np.arange(len(node) + 1) * node.shape[1], (len(node), len(self.splines))
+        weights = csr_array((share.astype(np.float32).ravel(), node.ravel(), ends), shape=size)
+        mean_spline = weights @ self.splines.reshape(len(self.splines), -1)
+        return np.asarray(mean_spline.reshape(len(centre), *self.splines.shape[1:]))
 
     def outer_shares(self, centre: np.ndarray, flux: np.ndarray, side_px: int) -> np.ndarray:
         """Return `psfdae.psf.wings.outer_shares` of stars from the PSFs of the nodes around them.

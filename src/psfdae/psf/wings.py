@@ -21,7 +21,6 @@ import numpy as np
 
 from psfdae.base.errors import keyword
 from psfdae.image.fits_file import Card
-from psfdae.stars.bright_stars import magnitude
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,13 @@ class Wings:
         Covariance of `profile`.
     outer_share : float
         Mean `outer_shares` of the stars of the fit, for which s = 1.
-    outer_part_from : float
+    outer_part_start : float
         Radius at which the outer part of a stamp begins, as a fraction of half its side.
     steepness : float
         Power of 1/r in the tents, as for light scattered by mirrors and air.
     """
 
-    outer_part_from: ClassVar[float] = 0.7
+    outer_part_start: ClassVar[float] = 0.7
     steepness: ClassVar[float] = 3.0
 
     radius_px: np.ndarray
@@ -181,9 +180,7 @@ def choose_wings(wings: Wings | None, trained_wings: Wings | None) -> Wings | No
     return trained_wings
 
 
-def outer_shares(
-    draw: Callable[[np.ndarray], np.ndarray], position: np.ndarray, flux: np.ndarray | None = None
-) -> np.ndarray:
+def outer_shares(draw: Callable[[np.ndarray], np.ndarray], position: np.ndarray) -> np.ndarray:
     """Return the fractions of the fluxes of n stars that are in the outer part of their stamps.
 
     The outer part is the ring between 0.7 and 1 times half the side of the stamp.
@@ -194,8 +191,6 @@ def outer_shares(
         Function that returns the PSFs (m, d, d) at m rows of `position`, with its columns.
     position : ndarray, shape (n, 2) to (n, 4)
         x and y in px, magnitude and colour, on which the PSF depends.
-    flux : ndarray, shape (n,), optional
-        Fluxes in counts; their magnitudes become the third column of positions (n, 2).
 
     Returns
     -------
@@ -205,8 +200,6 @@ def outer_shares(
     shares = np.full(len(position), np.nan)
     # At whole pixels, so that the position of a star in its pixel does not change the share.
     position = np.column_stack([np.rint(position[:, :2]), position[:, 2:]])
-    if flux is not None:
-        position = np.column_stack([position, magnitude(flux)])
     rows_with_position = np.flatnonzero(np.isfinite(position[:, :3]).all(axis=1))
     # 2048 stars at a time, to limit the memory of their PSFs.
     for first in range(0, len(rows_with_position), 2048):
@@ -221,7 +214,7 @@ def sum_outer_part(psf: np.ndarray) -> np.ndarray:
     side = psf.shape[-1]
     axis = np.arange(side) - side // 2
     radius = np.hypot(axis[:, None], axis)
-    ring = (radius >= Wings.outer_part_from * side / 2) & (radius < side / 2)
+    ring = (radius >= Wings.outer_part_start * side / 2) & (radius < side / 2)
     return np.asarray(psf[..., ring].sum(axis=-1))
 
 
@@ -251,7 +244,7 @@ def compute_prior_profile(
     """
     half = radius_px[0]
     # a: ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
-    outer_term = Wings.outer_part_from**-3.0 - 1.0
+    outer_term = Wings.outer_part_start**-3.0 - 1.0
     edge_light = max(outer_share, 0.0) * 3.0 / (2.0 * np.pi * half**2 * outer_term)
     # The light in the ring of the sky, at 1.5 h, was taken for sky, and subtracted in the stamp.
     prior_profile = edge_light * np.append(
