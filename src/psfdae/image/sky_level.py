@@ -305,7 +305,9 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
     is_finite = np.isfinite(a) & np.isfinite(b)
     if np.count_nonzero(is_finite) < 1000:
         return 0.0
-    a, b = a[is_finite], b[is_finite]
+    # 2^18 pairs are enough, evenly spread: ρ has the error 0.003.
+    step = np.count_nonzero(is_finite) // 2**18 + 1
+    a, b = a[is_finite][::step], b[is_finite][::step]
     plus, minus = (float(np.median(np.abs(v - np.median(v)))) ** 2 for v in (a + b, a - b))
     return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
 

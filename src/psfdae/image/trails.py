@@ -117,15 +117,17 @@ def find_spikes(
     ndarray of bool, shape (h, w)
         True for pixels of spikes.
     """
+    spikes, cores = np.zeros(image.shape, dtype=bool), find_saturated_cores(is_saturated)
+    if not len(cores):
+        return spikes
     from astropy.nddata import overlap_slices
     from skimage.transform import warp_polar
 
-    spikes = np.zeros(image.shape, dtype=bool)
     snr = smooth_light(image, bad, sky) / sky.noise
     part_px, angles, parts = 8, 720, 32
     reach_px = part_px * parts
     shape = angles, reach_px
-    for x, y, core_px in find_saturated_cores(is_saturated):
+    for x, y, core_px in cores:
         middle = y, x
         first_part = int(2.0 * core_px / part_px) + 1
         # A core as long as the rays has none; the level of saturation is probably wrong.

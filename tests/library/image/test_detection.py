@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from photutils.segmentation import deblend_sources, detect_sources
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.camera import camera_values
-from psfdae.image.detection import _smooth, find_sources, is_on_source
+from psfdae.image.detection import (
+    _smooth,
+    find_sources,
+    is_on_source,
+    label_areas,
+    part_sources,
+)
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
@@ -57,6 +65,28 @@ def opened(path, **stated):
 
 
 # Finding
+
+
+@pytest.mark.parametrize("levels", [8, 32])
+def test_sources_are_parted_as_photutils_parts_them(levels):
+    """Groups of one to four stars of many fluxes, some of them too faint to be a part."""
+    rng = np.random.default_rng(2)
+    light = np.zeros((300, 300))
+    middle = np.repeat(rng.uniform(20, 280, (60, 2)), rng.integers(1, 5, 60), axis=0)
+    row, column = np.rint(middle + rng.normal(0, 3, middle.shape)).astype(int).T
+    np.add.at(light, (row, column), 10 ** rng.uniform(2.5, 5, len(row)))
+    light = ndimage.gaussian_filter(light, 1.3)
+    image = ndimage.gaussian_filter(light + rng.normal(0, 1, light.shape), 0.8).astype(np.float32)
+    hidden = rng.uniform(size=image.shape) < 0.002
+    sources = detect_sources(image, 2.0, 5, mask=hidden)
+    options = {"n_levels": levels, "contrast": 0.005, "progress_bar": False}
+    expected = deblend_sources(image, sources, 5, **options).data
+    areas = label_areas((image > 2.0) & ~hidden, 5)
+    parts = part_sources(image, areas, 5, levels)
+    count = len(np.unique(expected)) - 1
+    assert sources.n_labels + 20 < count == len(np.unique(parts)) - 1
+    # The same pixels belong together, whatever their numbers.
+    assert len(np.unique(np.stack([expected.ravel(), parts.ravel()]), axis=1).T) == count + 1
 
 
 def test_stars_are_found_where_they_are(field):

@@ -25,7 +25,8 @@ from psfdae.image.selection import Candidates, Verdict
 from psfdae.methods.field import FieldMixture, select_fit_stars
 from psfdae.methods.field.fit import FieldFitter, FitOptions
 from psfdae.methods.field.nodes import node_step
-from psfdae.methods.field.posterior import log_node_prior
+from psfdae.methods.field.pairs import FieldStamps
+from psfdae.methods.field.posterior import log_node_prior, match_flux
 from psfdae.methods.field.prior import FieldPrior, PosteriorLimits
 from psfdae.methods.field.search import fit_field
 from psfdae.methods.interface import TrainingSet
@@ -283,6 +284,31 @@ def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr):
     assert np.abs(result.psf - every.psf).max() < 0.01 * every.sigma.max()
     assert result.measurements.flux == pytest.approx(every.measurements.flux, rel=1e-3)
     assert result.evidence == pytest.approx(every.evidence, abs=2e-3)
+
+
+def test_bright_stars_are_fitted_in_the_nodes_about_their_centre(field):
+    """However bright a star of unknown flux is: in few nodes, all of them near its centre."""
+    faint = Faint(20, 5000.0)
+    images = faint.stamps.reshape(20, -1) - 3.0
+    unknown = np.full(20, np.nan)
+    columns = {
+        "noise": faint.sigma,
+        "flux": unknown,
+        "unit": np.ones(20),
+        "terms": np.ones((20, 1)),
+    }
+    stars = FieldStamps(
+        images=images,
+        log_prior=log_node_prior(field, np.full((20, 2), np.nan)),
+        sky_known=np.zeros(20, bool),
+        unit_per_electron=np.zeros(20),
+        cell_sigma_px=np.full(20, field.cell_sigma_px),
+        **columns,
+    )
+    is_nearby = match_flux(field, stars)[1]
+    assert (is_nearby.sum(axis=1) <= 12).all()
+    offset_px = np.abs(field.places - faint.centre[:, None] - 0.1).max(axis=2)
+    assert offset_px[is_nearby].max() < 3 * field.step_px
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])
