@@ -138,16 +138,19 @@ def recorded(tmp_path, monkeypatch):
     [
         ({"n": 50}, ["NOT COMPARABLE", "test stars 50 (A), 500 (B)"]),
         ({}, ["- 12 are equal", "in 2 of 2 columns of A and in 2 of B; 0 have"]),
-        # 3 standard deviations of the difference of two such fits are 13 % of the error.
+        # 3 standard deviations of the difference of two such fits are 13 % of the MSE, and 28 % of
+        # 1 − SSIM.
         ({"dae": 1.12}, ["- 8 are equal", "- 4 differ within", "- 0 differ by more"]),
         (
             {"dae": 1.14, "noisy": 1.001},
             [
-                "- 4 differ by more\n  - d, random, realisation: dae at λ = 0.001, 0.002",
+                "- 2 differ by more\n  - d, random, realisation: dae at λ = 0.001, 0.002",
+                "- 2 differ within",
                 "- 4 differ, but their scatter",
                 "  - d, random, realisation: noisy at λ = 0.001, 0.002",
             ],
         ),
+        ({"dae": 1.4}, ["- 4 differ by more"]),
         ({"dae": 2.5}, ["in 0 of 2 columns of A and in 2 of B; 2 have", "realisation, λ = 0.001"]),
     ],
 )
