@@ -1,9 +1,10 @@
 """Errors, coverage and time of a network, alone and with wavefronts that the optics refine.
 
-    python studies/posterior_network/errors.py RESULTS DATASET OUT.csv [OVERRIDE ...]
+    python studies/posterior_network/errors.py RESULTS DATASET FIT.h5 OUT.csv [OVERRIDE ...]
 
 RESULTS is the folder of a run with the stars of DATASET; settings are changed by overrides such as
-posterior_network.epochs=8. The least possible errors are those of the run of record. One thread.
+posterior_network.epochs=8. The least possible errors are those of the run of record. The fit is
+written to FIT.h5, or read from there if it exists. One thread.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import csv
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import process_time
 
 import numpy as np
@@ -21,6 +21,7 @@ import torch
 from psfdae.base.files import read_product
 from psfdae.base.threads import limit_threads
 from psfdae.methods import method
+from psfdae.methods.interface import HISTORY
 from psfdae.methods.metrics import mse
 from psfdae.training.star_sets import training_set
 from psfdae_paper.bounds.estimates import SPLIT, read_test_stars
@@ -63,19 +64,27 @@ def measure(fitted, config, tested, dataset):
         }
 
 
-def main(results, dataset, out, *overrides):
+def fit(data, config, place):
+    """Fit the network with its optics, and save it with its settings and its history."""
+    refined, groups = method("posterior_network_refined"), ("seed", "noise", "posterior_network")
+    start = process_time()
+    fitted = refined.fit(data, config.posterior_network)
+    settings = {**config.model_dump(include={*groups}), "fit_cpu_s": process_time() - start}
+    fitted.save(place, settings)
+    pd.DataFrame(fitted.diagnostic_rows[HISTORY]).to_csv(place.with_suffix(".csv"), index=False)
+
+
+def main(results, dataset, place, out, *overrides):
     """Fit the network with its optics, and append rows to a table."""
     limit_threads(1)
     torch.set_num_threads(1)
     config = load([f"dataset={dataset}", *overrides])
     product = read_product(Path(results) / STARS[dataset], "stars")
-    refined, settings = method("posterior_network_refined"), config.posterior_network
-    with TemporaryDirectory() as folder:
+    refined, place = method("posterior_network_refined"), Path(place)
+    if not place.exists():
         kinds = config, refined, product, SPLIT, "realisation"
-        data = training_set(*kinds, checkpoint=Path(folder, "checkpoint"))
-        start = process_time()
-        fitted = refined.fit(data, settings)
-        fit_s = process_time() - start
+        fit(training_set(*kinds, checkpoint=place.with_suffix(".pt")), config, place)
+    fitted, settings = refined.load(place), refined.read_config(place)
     tested, path = read_test_stars(config, product), Path(out)
     # The network alone is a part of the same fit.
     alone = method("posterior_network")(fitted.network)
@@ -84,9 +93,9 @@ def main(results, dataset, out, *overrides):
         {
             "dataset": dataset,
             "method": name,
-            "epochs": settings.epochs,
-            "stars_per_epoch": settings.stars,
-            "fit_cpu_s": f"{fit_s:.1f}",
+            "epochs": settings["posterior_network"]["epochs"],
+            "stars_per_epoch": settings["posterior_network"]["stars"],
+            "fit_cpu_s": f"{settings['fit_cpu_s']:.1f}",
             **row,
         }
         for name, kind in methods.items()

@@ -45,9 +45,10 @@ def main():
         for distance in DISTANCES:
             start = truth + distance * rng.standard_normal(truth.shape)
             # Without a network's PSF there is one climb, which ends after the last expansion.
-            anything = NetworkStarts(
-                start[:, None], stars.stamps, np.full(stars.stamps.shape, np.inf)
-            )
+            root = WavefrontCoordinates.to_coordinates / max(distance, 1e-3)
+            precision = np.broadcast_to(root.T @ root, (STARS, 1, 8, 8))
+            proposals = start[:, None], precision, np.ones((STARS, 1))
+            anything = NetworkStarts(*proposals, stars.stamps, np.full(stars.stamps.shape, np.inf))
             for expansions in (2, 3):
                 Refiner.max_steps, Refiner.min_gain = expansions, 0.0
                 refined = Refiner(prior, *optics).refine(noisy, level, anything)

@@ -386,8 +386,12 @@ class StampDenoiser(Denoiser):
             # Only a model with a limit asks how unlike the training stars they are.
             if self.bundle.errors.outlier_limit is not None:
                 clusters = {name: values[has_flux] for name, values in near_clusters.items()}
-                score[has_flux] = self._free_flux.outlier_score(
-                    images[has_flux], noise_level[has_flux], **clusters
+                score[has_flux] = (
+                    self._free_flux.outlier_score(
+                        images[has_flux], noise_level[has_flux], **clusters
+                    )
+                    if estimate.outlier_score is None
+                    else estimate.outlier_score[has_flux]
                 )
         # The parts again, without centres.
         ends = np.cumsum([0, *(len(part.stars) for part in centred_stars)])

@@ -18,9 +18,9 @@ A telescope of rotational symmetry has mirrored stars at mirrored positions. The
 these mirror images (group convolutions, Cohen & Welling 2016, ICML 48, 2990): every hidden
 feature exists once for each symmetry, with the same weights.
 
-For stars with random Seidel aberrations, another layer may propose wavefronts: a mixture of
+For stars with random Seidel aberrations, a second network proposes wavefronts: a mixture of
 Gaussians of the eight coefficients of pupil monomials on which a stamp depends
-(`WavefrontCoordinates`).
+(`WavefrontCoordinates`). Its training begins with the weights of the trained network.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from torch import nn
 from torch.nn import functional
 
 from psfdae.base.rng import stream
-from psfdae.methods.interface import TrainingSet
+from psfdae.methods.interface import Estimate, TrainingSet
 from psfdae.methods.networks.training import Muon, Row, Training, use_half_precision
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients
 from psfdae.stars.noise import NoiseModel
@@ -57,9 +57,7 @@ class WavefrontCoordinates:
     """Coordinates of the wavefronts that give a stamp, which mirror images permute up to signs.
 
     A stamp depends on the coefficients of the eight pupil monomials, with tilts that move it from
-    the chief ray to its place. Spherical aberration and coma are balanced by focus and tilt, so
-    that errors of the coordinates are nearly independent. The middle is the pixel d // 2, about
-    which stamps are mirrored.
+    the chief ray to its place. The middle is the pixel d // 2, about which stamps are mirrored.
     """
 
     size = len(MONOMIALS)
@@ -67,10 +65,12 @@ class WavefrontCoordinates:
     to_coordinates = np.zeros((size, size))
     """Matrix from coefficients (r4, r2x, r2y, xx, xy, yy, x, y), in rows: spherical aberration,
     coma, focus, astigmatism, tilts."""
-    to_coordinates[[0, 1, 2, 3, 6, 7], [0, 1, 2, 0, 6, 7]] = 1.0
+    to_coordinates[[0, 1, 2, 6, 7], [0, 1, 2, 6, 7]] = 1.0
     to_coordinates[3, [3, 5]] = to_coordinates[5, 4] = 0.5
     to_coordinates[4, [3, 5]] = 0.5, -0.5
-    to_coordinates[[6, 7], [1, 2]] = 2.0 / 3.0
+
+    order = np.array([0, 4, 4, 1, 2, 3, 5, 5])
+    """Order in which errors of coordinates depend on each other; a pair has the same number."""
 
     @classmethod
     def encode(cls, coefficients: np.ndarray, pixel: float) -> np.ndarray:
@@ -272,22 +272,38 @@ def normalise(features: torch.Tensor) -> torch.Tensor:
 class Proposals(NamedTuple):
     """Mixture of K Gaussians of each star's wavefront, in `WavefrontCoordinates`.
 
+    Prior and image determine some sums of coordinates far better than the coordinates. The
+    deviations d of a Gaussian are independent after elimination, as (1 + N) d with a strictly
+    triangular N: each one less the part that those before it in `WavefrontCoordinates.order`
+    explain.
+
     Attributes
     ----------
     log_weight : Tensor, shape (n, K)
         Logarithm of the probability of each Gaussian.
-    mean, log_sd : Tensor, shape (n, K, 8)
-        Coordinates, and the logarithms of their standard deviations, standardised in the network.
+    mean : Tensor, shape (n, K, 8)
+        Coordinates, standardised in the network.
+    log_sd : Tensor, shape (n, K, 8)
+        Logarithms of the standard deviations of (1 + N) d.
+    couplings : Tensor, shape (n, K, 8, 8)
+        Matrix N.
     """
 
     log_weight: torch.Tensor
     mean: torch.Tensor
     log_sd: torch.Tensor
+    couplings: torch.Tensor
+
+    @property
+    def root(self) -> torch.Tensor:
+        """Matrices R = s⁻¹ (1 + N), (n, K, 8, 8): RᵀR is the inverse covariance."""
+        return torch.exp(-self.log_sd)[..., None] * (self.couplings + torch.eye(self.mean.shape[2]))
 
     def log_density(self, wavefront: torch.Tensor) -> torch.Tensor:
         """Return the log-density (n,) at coordinates (n, 8), without the constant of a Gaussian."""
-        distance = (wavefront[:, None] - self.mean) * torch.exp(-self.log_sd)
-        log_part = self.log_weight - (self.log_sd + 0.5 * distance.square()).sum(dim=2)
+        # N is strictly triangular: the determinant of R is the product of 1 / s.
+        distance = self.root @ (wavefront[:, None] - self.mean)[..., None]
+        log_part = self.log_weight - self.log_sd.sum(dim=2) - 0.5 * distance.square().sum((2, 3))
         return torch.logsumexp(log_part, dim=1)
 
 
@@ -298,36 +314,14 @@ class Outputs(NamedTuple):
     ----------
     psf, log_sigma : Tensor, shape (n, P)
         Estimates, and the logarithms of their standard deviations.
-    proposals : Proposals or None
-        Wavefronts; None if the network does not propose any.
     """
 
     psf: torch.Tensor
     log_sigma: torch.Tensor
-    proposals: Proposals | None
 
 
-class NetworkEstimate(NamedTuple):
-    """Estimates of n stars.
-
-    Attributes
-    ----------
-    psf, sigma : ndarray, shape (n, d, d), float32
-        PSFs, and the standard deviation of each pixel.
-    wavefront : ndarray, shape (n, K, 8)
-        Proposals in `WavefrontCoordinates`; K = 0 if the network does not propose any.
-    log_weight : ndarray, shape (n, K)
-        Logarithms of their probabilities.
-    """
-
-    psf: np.ndarray
-    sigma: np.ndarray
-    wavefront: np.ndarray
-    log_weight: np.ndarray
-
-
-class PosteriorNetwork(nn.Module):
-    """Residual network of group convolutions; see the module.
+class FeatureNetwork(nn.Module):
+    """Residual group convolutions from images to features; see the module.
 
     Parameters
     ----------
@@ -337,34 +331,17 @@ class PosteriorNetwork(nn.Module):
         Noise of the images.
     """
 
-    statistics = (
-        *("mean", "axes", "variance", "levels", "sigma_scale", "sigma_ratio95", "points"),
-        *("wavefront_mean", "wavefront_sd"),
-    )
-    weights = (
-        *("input", "input_level", "input_position", "expand", "expand_level", "reduce"),
-        *("output", "output_sigma", "output_wavefront"),
-    )
-    proposals = 4
-    """Gaussians of the mixture of wavefronts."""
+    statistics: tuple[str, ...] = ("mean", "axes", "variance", "levels")
+    weights: tuple[str, ...] = ("input", "input_level", "expand", "expand_level", "reduce")
     mean: torch.Tensor
     axes: torch.Tensor
     variance: torch.Tensor
     levels: torch.Tensor
-    sigma_scale: torch.Tensor
-    sigma_ratio95: torch.Tensor
-    points: torch.Tensor
-    wavefront_mean: torch.Tensor
-    wavefront_sd: torch.Tensor
     input: nn.Parameter
     input_level: nn.Parameter
-    input_position: nn.Parameter
     expand: nn.ParameterList
     expand_level: nn.ParameterList
     reduce: nn.ParameterList
-    output: nn.Parameter
-    output_sigma: nn.Parameter
-    output_wavefront: nn.Parameter
 
     def __init__(self, arrays: Mapping[str, np.ndarray], noise: NoiseModel) -> None:
         super().__init__()
@@ -384,8 +361,126 @@ class PosteriorNetwork(nn.Module):
         images = [symmetry.image(index)[:side, :side] for symmetry in SYMMETRIES]
         self.filters = torch.from_numpy(np.stack([image.ravel() for image in images]))
         self.waves = torch.from_numpy(list_representations().astype(np.float32))
-        mirrors = WavefrontCoordinates.mirror()
-        self.wavefront_mirrors = torch.from_numpy(mirrors.astype(np.float32))
+
+    def transform_filters(self, weight: torch.Tensor) -> torch.Tensor:
+        """Return filters (G, b, P) of stamps, by representation, of filters (b, (d + 1)²)."""
+        return torch.einsum("rg,bgp->rbp", self.waves, weight[:, self.filters])
+
+    def transform_kernels(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the matrices of a group convolution with weights (b, G, a), by representation.
+
+        Returns
+        -------
+        scalars : Tensor, shape (4, a, b)
+            Matrices of the representations of one dimension.
+        pairs : Tensor, shape (2a, 2b)
+            Matrix of both rows of the representation of two dimensions.
+        """
+        # A convolution is a product of the transforms; waves are orthonormal, the matrices of a
+        # representation are √(G / its dimension) times as large.
+        _, group, width = weight.shape
+        kernels = torch.einsum("rg,bga->rab", self.waves, weight) * group**0.5
+        scalars, elements = kernels.split(4)
+        # Rows are features (l, a), columns (j, b), of the matrix element (j, l).
+        pairs = (elements / 2**0.5).unflatten(0, (2, 2)).permute(1, 2, 0, 3)
+        return scalars, pairs.reshape(2 * width, -1)
+
+    def convolve(
+        self, features: torch.Tensor, matrices: tuple[torch.Tensor, torch.Tensor]
+    ) -> torch.Tensor:
+        """Map features (G, n, a), by representation, to features (G, n, b)."""
+        stars = features.shape[1]
+        scalars = features[:4] @ matrices[0]
+        # Features (i, j) of both rows i of the matrices have the same weights.
+        rows = features[4:].unflatten(0, (2, 2)).transpose(1, 2).reshape(2 * stars, -1)
+        pairs = (rows @ matrices[1]).view(2, stars, 2, -1).transpose(1, 2).flatten(0, 1)
+        return torch.cat([scalars, pairs])
+
+    def matrices(self) -> Matrices:
+        """Return the matrices of all layers."""
+        return {
+            # The input is given in the eigenvectors.
+            "input": [self.transform_filters(self.input).flatten(0, 1) @ self.axes],
+            "expand": [self.transform_kernels(weight) for weight in self.expand],
+            "reduce": [self.transform_kernels(weight) for weight in self.reduce],
+        }
+
+    def encode_level(self, level: torch.Tensor) -> torch.Tensor:
+        """Return features (n, 4) of noise levels: powers of ln λ, scaled to ±1 in training."""
+        low, high = self.levels.log().aminmax()
+        half = torch.clamp((high - low) / 2, min=1e-3)
+        scaled = torch.clamp((level.log() - (low + high) / 2) / half, -1.0, 1.0)
+        return torch.stack([scaled**power for power in range(4)], dim=1)
+
+    def compute_variance(self, level: torch.Tensor) -> torch.Tensor:
+        """Return the noise variance (n, 1) at levels (n,), with the photons of the mean star."""
+        photons = self.noise.kappa / self.noise.background**0.5 / len(self.mean)
+        variance: torch.Tensor = (self.noise.kappa * level) ** 2 + photons * level
+        return variance[:, None]
+
+    def compute_features(
+        self,
+        inputs: torch.Tensor,
+        level: torch.Tensor,
+        matrices: Matrices,
+        constant: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Return features (G, n, width), by representation.
+
+        Parameters
+        ----------
+        inputs : Tensor, shape (n, P)
+            Images in the eigenvectors, over √(v + s²).
+        level : Tensor, shape (n,)
+            Noise levels λ.
+        matrices : mapping
+            Result of `matrices`.
+        constant : Tensor, shape (G, n, width), optional
+            Term that is added to the first features.
+        """
+        with use_half_precision():
+            levels = self.encode_level(level)
+            # The level is the same for all symmetries.
+            features = functional.linear(inputs, matrices["input"][0])
+            features = features.unflatten(1, (len(SYMMETRIES), -1)).transpose(0, 1).contiguous()
+            of_level = functional.linear(levels, self.input_level)[None]
+            features = features + self.waves.sum(dim=1)[:, None, None] * of_level
+            if constant is not None:
+                features = features + constant
+            for expand, reduce, of_level in zip(
+                matrices["expand"], matrices["reduce"], self.expand_level, strict=True
+            ):
+                inner = self.convolve(normalise(features), expand)
+                # The activation function acts on the features of all symmetries.
+                mirrored = (self.waves.T @ inner.flatten(1)).view_as(inner)
+                mirrored = functional.gelu(mirrored + functional.linear(levels, of_level))
+                inner = (self.waves @ mirrored.flatten(1)).view_as(inner)
+                features = features + self.convolve(inner, reduce)
+            return normalise(features)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the statistics and the weights by name."""
+        arrays = {name: getattr(self, name) for name in (*self.statistics, *self.weights)}
+        return {
+            name: (torch.stack([*value]) if isinstance(value, nn.ParameterList) else value)
+            .detach()
+            .numpy()
+            .copy()
+            for name, value in arrays.items()
+        }
+
+
+class PosteriorNetwork(FeatureNetwork):
+    """Network that corrects the linear estimate of PSFs; see the module."""
+
+    statistics = (*FeatureNetwork.statistics, "sigma_scale", "sigma_ratio95", "points")
+    weights = (*FeatureNetwork.weights, "input_position", "output", "output_sigma")
+    sigma_scale: torch.Tensor
+    sigma_ratio95: torch.Tensor
+    points: torch.Tensor
+    input_position: nn.Parameter
+    output: nn.Parameter
+    output_sigma: nn.Parameter
 
     @classmethod
     def build(
@@ -426,66 +521,16 @@ class PosteriorNetwork(nn.Module):
             "reduce": np.zeros((blocks, width, group, hidden)),
             "output": np.zeros((width, pixels)),
             "output_sigma": np.zeros((width, pixels)),
-            # Small, but different for each Gaussian.
-            "output_wavefront": 0.1
-            * draw(cls.proposals, 1 + 2 * len(statistics["wavefront_mean"]), width, inputs=width),
         }
         return cls({**statistics, **weights}, noise)
 
-    def transform_filters(self, weight: torch.Tensor) -> torch.Tensor:
-        """Return filters (G, b, P) of stamps, by representation, of filters (b, (d + 1)²)."""
-        return torch.einsum("rg,bgp->rbp", self.waves, weight[:, self.filters])
-
-    def transform_kernels(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the matrices of a group convolution with weights (b, G, a), by representation.
-
-        Returns
-        -------
-        scalars : Tensor, shape (4, a, b)
-            Matrices of the representations of one dimension.
-        pairs : Tensor, shape (2a, 2b)
-            Matrix of both rows of the representation of two dimensions.
-        """
-        # A convolution is a product of the transforms; waves are orthonormal, the matrices of a
-        # representation are √(G / its dimension) times as large.
-        _, group, width = weight.shape
-        kernels = torch.einsum("rg,bga->rab", self.waves, weight) * group**0.5
-        scalars, elements = kernels.split(4)
-        # Rows are features (l, a), columns (j, b), of the matrix element (j, l).
-        pairs = (elements / 2**0.5).unflatten(0, (2, 2)).permute(1, 2, 0, 3)
-        return scalars, pairs.reshape(2 * width, -1)
-
-    def convolve(
-        self, features: torch.Tensor, matrices: tuple[torch.Tensor, torch.Tensor]
-    ) -> torch.Tensor:
-        """Map features (G, n, a), by representation, to features (G, n, b)."""
-        stars = features.shape[1]
-        scalars = features[:4] @ matrices[0]
-        # Features (i, j) of both rows i of the matrices have the same weights.
-        rows = features[4:].unflatten(0, (2, 2)).transpose(1, 2).reshape(2 * stars, -1)
-        pairs = (rows @ matrices[1]).view(2, stars, 2, -1).transpose(1, 2).flatten(0, 1)
-        return torch.cat([scalars, pairs])
-
     def matrices(self) -> Matrices:
-        """Return the matrices of all layers."""
-        first, last, of_sigma = (
+        """Return the matrices of all layers; the correction is given in the eigenvectors."""
+        last, of_sigma = (
             self.transform_filters(weight).flatten(0, 1)
-            for weight in (self.input, self.output, self.output_sigma)
+            for weight in (self.output, self.output_sigma)
         )
-        return {
-            # Input and correction are given in the eigenvectors.
-            "input": [first @ self.axes],
-            "expand": [self.transform_kernels(weight) for weight in self.expand],
-            "reduce": [self.transform_kernels(weight) for weight in self.reduce],
-            "output": [torch.cat([last @ self.axes, of_sigma], dim=1)],
-        }
-
-    def encode_level(self, level: torch.Tensor) -> torch.Tensor:
-        """Return features (n, 4) of noise levels: powers of ln λ, scaled to ±1 in training."""
-        low, high = self.levels.log().aminmax()
-        half = torch.clamp((high - low) / 2, min=1e-3)
-        scaled = torch.clamp((level.log() - (low + high) / 2) / half, -1.0, 1.0)
-        return torch.stack([scaled**power for power in range(4)], dim=1)
+        return {**super().matrices(), "output": [torch.cat([last @ self.axes, of_sigma], dim=1)]}
 
     def encode_position(self, position: torch.Tensor) -> torch.Tensor:
         """Return polynomials (n, G, 9) of the mirrored grid indices (n, 2)."""
@@ -516,102 +561,157 @@ class PosteriorNetwork(nn.Module):
         matrices : mapping, optional
             Result of `matrices`.
         """
-        matrices, group = matrices or self.matrices(), len(SYMMETRIES)
-        # The linear estimate and its standard deviation; noise of the mean star's photons included.
-        photons = self.noise.kappa / np.sqrt(self.noise.background) / noisy.shape[1]
-        noise = ((self.noise.kappa * level) ** 2 + photons * level)[:, None]
-        total = self.variance + noise
-        deviation = (noisy - self.mean) @ self.axes
+        matrices = matrices or self.matrices()
+        # The linear estimate and its standard deviation.
+        noise = self.compute_variance(level)
+        total, deviation = self.variance + noise, (noisy - self.mean) @ self.axes
         linear, spread = self.variance / total * deviation, (self.variance * noise / total).sqrt()
+        constant = None
+        if position is not None and self.input_position.numel():
+            terms = functional.linear(self.encode_position(position), self.input_position)
+            constant = torch.einsum("rg,ngc->rnc", self.waves, terms)
+        features = self.compute_features(deviation / total.sqrt(), level, matrices, constant)
         with use_half_precision():
-            levels = self.encode_level(level)
-            # Features (G, n, width) by representation; the level is the same for all symmetries.
-            features = functional.linear(deviation / total.sqrt(), matrices["input"][0])
-            features = features.unflatten(1, (group, -1)).transpose(0, 1).contiguous()
-            constant = functional.linear(levels, self.input_level)[None]
-            features = features + self.waves.sum(dim=1)[:, None, None] * constant
-            if position is not None and self.input_position.numel():
-                terms = functional.linear(self.encode_position(position), self.input_position)
-                features = features + torch.einsum("rg,ngc->rnc", self.waves, terms.float())
-            for expand, reduce, of_level in zip(
-                matrices["expand"], matrices["reduce"], self.expand_level, strict=True
-            ):
-                inner = self.convolve(normalise(features), expand)
-                # The activation function acts on the features of all symmetries.
-                mirrored = (self.waves.T @ inner.flatten(1)).view_as(inner)
-                mirrored = functional.gelu(mirrored + functional.linear(levels, of_level))
-                inner = (self.waves @ mirrored.flatten(1)).view_as(inner)
-                features = features + self.convolve(inner, reduce)
-            features = normalise(features)
             outputs = features.transpose(0, 1).flatten(1) @ matrices["output"][0]
         correction, log_ratio = outputs.float().chunk(2, dim=1)
         # σ of a pixel is a multiple of the RMS error of the linear estimate.
         log_scale = 0.5 * spread.square().mean(dim=1, keepdim=True).log()
         return Outputs(
-            self.mean + (linear + spread * correction) @ self.axes.T,
-            log_ratio + log_scale,
-            self.propose(features) if len(self.wavefront_mean) else None,
+            self.mean + (linear + spread * correction) @ self.axes.T, log_ratio + log_scale
         )
-
-    def propose(self, features: torch.Tensor) -> Proposals:
-        """Return wavefronts of features (G, n, width) by representation, in single precision.
-
-        The feature of a symmetry g has seen the star that g moves to the image.
-        """
-        with torch.autocast("cpu", enabled=False):
-            views = torch.einsum("rg,rnw->gnw", self.waves, features.float())
-            values = torch.einsum("gnw,kvw->gnkv", views, self.output_wavefront)
-            return self.average_proposals(values)
-
-    def average_proposals(self, values: torch.Tensor) -> Proposals:
-        """Return the means over the symmetries of proposals (G, n, K, 17), each as it has seen."""
-        logits, mean, log_sd = values.split([1, *[WavefrontCoordinates.size] * 2], dim=3)
-        # Wavefronts are moved as the stars that the symmetries have seen.
-        group = len(SYMMETRIES)
-        return Proposals(
-            logits.mean(dim=0).squeeze(2).log_softmax(dim=1),
-            torch.einsum("gab,gnkb->nka", self.wavefront_mirrors, mean) / group,
-            torch.einsum("gab,gnkb->nka", self.wavefront_mirrors.abs(), log_sd) / group,
-        )
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the statistics and the weights by name."""
-        arrays = {name: getattr(self, name) for name in (*self.statistics, *self.weights)}
-        return {
-            name: (torch.stack([*value]) if isinstance(value, nn.ParameterList) else value)
-            .detach()
-            .numpy()
-            .copy()
-            for name, value in arrays.items()
-        }
 
     @torch.inference_mode()
     def estimate(
         self, noisy: np.ndarray, level: np.ndarray, position: np.ndarray | None, batch: int = 256
-    ) -> NetworkEstimate:
+    ) -> Estimate:
         """Return estimates of images (n, d, d) of levels (n,), with calibrated σ."""
-        matrices, parts = self.matrices(), []
+        matrices, (psf, sigma) = self.matrices(), np.empty((2, *noisy.shape), np.float32)
         for start in range(0, len(noisy), batch):
             part = slice(start, start + batch)
             inputs = [noisy[part].reshape(len(noisy[part]), -1), level[part]]
             inputs += [] if position is None else [position[part]]
             tensors = [torch.from_numpy(np.asarray(values, np.float32)) for values in inputs]
-            parts.append(self(*tensors, *[None] * (3 - len(tensors)), matrices))
-        psf, log_sigma = (
-            torch.cat([getattr(part, name) for part in parts]).numpy().reshape(noisy.shape)
-            for name in ("psf", "log_sigma")
-        )
+            outputs = self(*tensors, *[None] * (3 - len(tensors)), matrices)
+            shape = noisy[part].shape
+            psf[part] = outputs.psf.view(shape).numpy()
+            sigma[part] = outputs.log_sigma.exp().view(shape).numpy()
         scale = np.interp(np.log(level), np.log(self.levels.numpy()), self.sigma_scale.numpy())
-        sigma = np.exp(log_sigma) * scale[:, None, None].astype(np.float32)
-        if not len(self.wavefront_mean):
-            none = np.empty((len(noisy), 0))
-            return NetworkEstimate(psf, sigma, none.reshape(len(noisy), 0, 8), none)
-        proposals = [part.proposals for part in parts if part.proposals]
-        # Within the range of wavefronts that can be propagated.
-        scaled_mean = torch.cat([p.mean for p in proposals]).clamp(-4.0, 4.0)
-        mean = scaled_mean * self.wavefront_sd + self.wavefront_mean
-        log_weight = torch.cat([p.log_weight for p in proposals])
-        return NetworkEstimate(psf, sigma, mean.double().numpy(), log_weight.double().numpy())
+        return Estimate(psf, sigma * scale[:, None, None].astype(np.float32))
+
+
+class WavefrontNetwork(FeatureNetwork):
+    """Network that proposes wavefronts of stars with random Seidel aberrations."""
+
+    statistics = (*FeatureNetwork.statistics, "coordinate_mean", "coordinate_sd")
+    weights = (*FeatureNetwork.weights, "output")
+    gaussians = 8
+    """Gaussians of the mixture of wavefronts."""
+    order = WavefrontCoordinates.order
+    coupling_elements = np.flatnonzero(order[:, None] > order)
+    """Elements of the matrices N that are not 0, in the flat matrices."""
+    coordinate_mean: torch.Tensor
+    coordinate_sd: torch.Tensor
+    output: nn.Parameter
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], noise: NoiseModel) -> None:
+        super().__init__(arrays, noise)
+        mirrors = WavefrontCoordinates.mirror()
+        self.mirrors = torch.from_numpy(mirrors.astype(np.float32))
+
+    @classmethod
+    def begin(
+        cls, network: FeatureNetwork, wavefront: np.ndarray, rng: np.random.Generator
+    ) -> WavefrontNetwork:
+        """Return a network with the features of another network.
+
+        Parameters
+        ----------
+        network : FeatureNetwork
+            Trained network.
+        wavefront : ndarray, shape (n, 8)
+            Coordinates of stars, whose mean and standard deviations become the units.
+        rng : Generator
+            Source of the weights of the last layer.
+        """
+        # By symmetry, only spherical aberration and focus have a mean, and x and y the same
+        # scatter.
+        mean, sd = wavefront.mean(axis=0), wavefront.std(axis=0)
+        mean[[1, 2, 4, 5, 6, 7]] = 0.0
+        for pair in ([1, 2], [6, 7]):
+            sd[pair] = np.sqrt(np.square(sd[pair]).mean())
+        # Small weights, but different for each Gaussian.
+        width = len(network.input_level)
+        outputs = 1 + 2 * WavefrontCoordinates.size + len(cls.coupling_elements)
+        shape = cls.gaussians, outputs, width
+        layer = 0.1 * rng.standard_normal(shape) / np.sqrt(width)
+        arrays = {
+            **network.to_arrays(),
+            "coordinate_mean": mean,
+            # Coordinates that do not vary are standardised to 0.
+            "coordinate_sd": np.maximum(sd, 1e-3),
+            "output": layer,
+        }
+        return cls(arrays, network.noise)
+
+    def forward(
+        self, noisy: torch.Tensor, level: torch.Tensor, matrices: Matrices | None = None
+    ) -> Proposals:
+        """Map noisy images (n, P) of levels (n,) to wavefronts; see `PosteriorNetwork.forward`."""
+        total = self.variance + self.compute_variance(level)
+        inputs = ((noisy - self.mean) @ self.axes) / total.sqrt()
+        features = self.compute_features(inputs, level, matrices or self.matrices())
+        # The feature of a symmetry g has seen the star that g moves to the image.
+        with torch.autocast("cpu", enabled=False):
+            views = torch.einsum("rg,rnw->gnw", self.waves, features.float())
+            return self.average(torch.einsum("gnw,kvw->gnkv", views, self.output))
+
+    def average(self, values: torch.Tensor) -> Proposals:
+        """Return the means over the symmetries of proposals (G, n, K, ·), each as it has seen."""
+        size, group = WavefrontCoordinates.size, len(SYMMETRIES)
+        parts = [1, size, size, len(self.coupling_elements)]
+        logits, mean, log_sd, elements = values.split(parts, dim=3)
+        couplings = values.new_zeros(*values.shape[:3], size**2)
+        couplings[..., torch.from_numpy(self.coupling_elements)] = elements
+        couplings = couplings.unflatten(3, (size, size))
+        # Wavefronts are moved as the stars that the symmetries have seen.
+        mirrors = self.mirrors[:, None, None]
+        return Proposals(
+            logits.mean(dim=0).squeeze(2).log_softmax(dim=1),
+            torch.einsum("gab,gnkb->nka", self.mirrors, mean) / group,
+            torch.einsum("gab,gnkb->nka", self.mirrors.abs(), log_sd) / group,
+            (mirrors @ couplings @ mirrors.mT).mean(dim=0),
+        )
+
+    @torch.inference_mode()
+    def propose(
+        self, noisy: np.ndarray, level: np.ndarray, batch: int = 256
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the wavefronts of images (n, d, d) of levels (n,), the most likely first.
+
+        Returns
+        -------
+        log_weight : ndarray, shape (n, K)
+            Logarithms of their probabilities.
+        mean : ndarray, shape (n, K, 8)
+            Coordinates in waves.
+        root : ndarray, shape (n, K, 8, 8)
+            Matrices R, of which RᵀR are the inverse covariances.
+        """
+        matrices, size = self.matrices(), WavefrontCoordinates.size
+        shape = len(noisy), self.gaussians
+        log_weight, mean, root = (np.empty((*shape, *[size] * rank)) for rank in range(3))
+        for start in range(0, len(noisy), batch):
+            part = slice(start, start + batch)
+            inputs = noisy[part].reshape(len(noisy[part]), -1), level[part]
+            tensors = [torch.from_numpy(np.asarray(values, np.float32)) for values in inputs]
+            proposals = self(*tensors, matrices)
+            log_weight[part] = proposals.log_weight.numpy()
+            # Within the range of wavefronts that can be propagated.
+            scaled_mean = proposals.mean.clamp(-4.0, 4.0)
+            mean[part] = (scaled_mean * self.coordinate_sd + self.coordinate_mean).numpy()
+            root[part] = (proposals.root / self.coordinate_sd).numpy()
+        stars, order = np.arange(len(noisy))[:, None], np.argsort(-log_weight, axis=1)
+        return log_weight[stars, order], mean[stars, order], root[stars, order]
 
 
 def number_fields(position: np.ndarray, points: int) -> np.ndarray:
@@ -635,14 +735,6 @@ def measure_statistics(stars: DrawnStars, levels: np.ndarray, points: int) -> di
     mean = stars.stamps.mean(axis=0, dtype=np.float64)
     deviation = stars.stamps - mean
     variance, axes = np.linalg.eigh(deviation.T @ deviation / len(deviation))
-    # By symmetry, only spherical aberration and focus have a mean, and x and y the same scatter.
-    wavefront_mean, wavefront_sd = stars.wavefront.mean(axis=0), np.std(stars.wavefront, axis=0)
-    if len(wavefront_sd):
-        wavefront_mean[[1, 2, 4, 5, 6, 7]] = 0.0
-        for pair in ([1, 2], [6, 7]):
-            wavefront_sd[pair] = np.sqrt(np.square(wavefront_sd[pair]).mean())
-        # Coordinates that do not vary are standardised to 0.
-        wavefront_sd = np.maximum(wavefront_sd, 1e-3)
     return {
         "mean": mean,
         "axes": axes,
@@ -652,8 +744,6 @@ def measure_statistics(stars: DrawnStars, levels: np.ndarray, points: int) -> di
         "sigma_scale": np.ones(len(levels)),
         "sigma_ratio95": np.full(len(levels), 1.96),
         "points": np.array([points]),
-        "wavefront_mean": wavefront_mean,
-        "wavefront_sd": wavefront_sd,
     }
 
 
@@ -670,8 +760,6 @@ class PosteriorNetworkTraining(Training):
         Sizes of the network and course of the training.
     uses_position : bool
         Whether the position in the field is an input.
-    proposes_wavefronts : bool
-        Whether the network proposes wavefronts, too; its PSFs then need longer trainings.
     attempt : int
         Not used: these networks do not die.
     """
@@ -682,7 +770,8 @@ class PosteriorNetworkTraining(Training):
     grad_clip = 1.0
     half_precision_start = 0.0
     sigma_weight = 0.1
-    wavefront_weight = 0.03
+    first_epoch = 0
+    """Number of the first epoch, by which random streams and sets of stars are named."""
 
     def __init__(
         self,
@@ -690,25 +779,25 @@ class PosteriorNetworkTraining(Training):
         config: Config,
         settings: PosteriorNetworkSettings,
         uses_position: bool,
-        proposes_wavefronts: bool = False,
         attempt: int = 0,
     ) -> None:
         self.data, self.config = data, config
         self.fields = np.zeros(config.grid.points**2, bool)
         self.fields[number_fields(data.positions[data.train], config.grid.points)] = True
-        # Statistics of the first stars, and random weights.
-        self.stars = FreshStars.simulate(config, 0, settings.stars, self.fields)
-        stamp_draws = self.stars.draw(20_000, self.stream("statistics"))
-        if not proposes_wavefronts:
-            stamp_draws = stamp_draws._replace(wavefront=stamp_draws.wavefront[:, :0])
-        model = PosteriorNetwork.build(
-            measure_statistics(stamp_draws, data.levels, config.grid.points),
-            *(settings, data.noise, uses_position, self.stream("init")),
-        )
+        self.stars, self.sets = FreshStars.simulate(config, 0, settings.stars, self.fields), 1
         # Mean squared error at each noise level, over the latest steps.
         self.level_errors = [float("nan")] * len(data.levels)
-        self.sets = 1
+        stamps = self.stars.draw(20_000, self.stream("statistics"))
+        model = self.build(stamps, settings, uses_position)
         super().__init__(model, settings, settings.steps, attempt, key="posterior_network")
+
+    def build(
+        self, stars: DrawnStars, settings: PosteriorNetworkSettings, uses_position: bool
+    ) -> nn.Module:
+        """Return a network with the statistics of stars, and random weights."""
+        statistics = measure_statistics(stars, self.data.levels, self.config.grid.points)
+        rng = self.stream("init")
+        return PosteriorNetwork.build(statistics, settings, self.data.noise, uses_position, rng)
 
     def stream(self, *names: str | int) -> np.random.Generator:
         """Return the random stream of a purpose."""
@@ -723,6 +812,7 @@ class PosteriorNetworkTraining(Training):
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Yield stamps, noisy images, their levels' numbers, positions and wavefronts."""
+        epoch += self.first_epoch
         # One further set of stars for each epoch; a training that resumes simulates all of them.
         while self.sets <= epoch:
             new = FreshStars.simulate(self.config, self.sets, self.settings.stars, self.fields)
@@ -742,12 +832,10 @@ class PosteriorNetworkTraining(Training):
         """Return the mean over stars of the squared error over the latest errors of its level.
 
         All noise levels have the same weight in this way. The logarithm of the probability of the
-        errors by a normal distribution of the network's σ is added, and of the wavefront by the
-        mixture of proposals.
+        errors by a normal distribution of the network's σ is added.
         """
-        stamps, noisy, number, position, wavefront = batch
-        level = torch.from_numpy(self.data.levels.astype(np.float32))[number]
-        psf, log_sigma, proposals = self.model(noisy, level, position)
+        stamps, noisy, number, position, _ = batch
+        psf, log_sigma = self.model(noisy, self.levels[number], position)
         square = (psf - stamps) ** 2
         errors = square.mean(dim=1)
         for n, latest in enumerate(self.level_errors):
@@ -758,10 +846,12 @@ class PosteriorNetworkTraining(Training):
         weight = 1.0 / torch.tensor(self.level_errors)[number]
         improbability = log_sigma + 0.5 * square.detach() * torch.exp(-2.0 * log_sigma)
         loss: torch.Tensor = (weight * errors).mean() + self.sigma_weight * improbability.mean()
-        if proposals is not None:
-            scaled_wavefront = (wavefront - self.model.wavefront_mean) / self.model.wavefront_sd
-            loss = loss - self.wavefront_weight * proposals.log_density(scaled_wavefront).mean()
         return loss
+
+    @property
+    def levels(self) -> torch.Tensor:
+        """Noise levels (L,) of the training."""
+        return torch.from_numpy(self.data.levels.astype(np.float32))
 
     def validate(self, epoch: int) -> float:
         """Return the geometric mean over the noise levels of the validation stars' MSE."""
@@ -820,3 +910,49 @@ class PosteriorNetworkTraining(Training):
             "seconds": round(self.seconds, 3),
             "cpu_seconds": round(self.cpu_seconds, 3),
         }
+
+
+class WavefrontTraining(PosteriorNetworkTraining):
+    """Training of a network that proposes wavefronts, from the features of a trained network.
+
+    Parameters
+    ----------
+    data, config, settings
+        See `PosteriorNetworkTraining`.
+    network : PosteriorNetwork
+        Network of an earlier training with these settings, whose epochs this one continues: stars
+        and noise are others than there.
+    attempt : int
+        Not used: these networks do not die.
+    """
+
+    model: WavefrontNetwork  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        data: TrainingSet,
+        config: Config,
+        settings: PosteriorNetworkSettings,
+        network: PosteriorNetwork,
+        attempt: int = 0,
+    ) -> None:
+        self.network, self.first_epoch = network, settings.epochs
+        super().__init__(data, config, settings, uses_position=False, attempt=attempt)
+
+    def build(
+        self, stars: DrawnStars, settings: PosteriorNetworkSettings, uses_position: bool
+    ) -> nn.Module:
+        """Return a network with the features of the earlier one."""
+        return WavefrontNetwork.begin(self.network, stars.wavefront, self.stream("wavefront"))
+
+    def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
+        """Return the mean over stars of −ln of the probability of their wavefronts."""
+        _, noisy, number, _, wavefront = batch
+        scaled_wavefront = (wavefront - self.model.coordinate_mean) / self.model.coordinate_sd
+        proposals = self.model(noisy, self.levels[number])
+        loss: torch.Tensor = -proposals.log_density(scaled_wavefront).mean()
+        return loss
+
+    def validate(self, epoch: int) -> float:
+        """Return NaN: the last weights are used."""
+        return float("nan")

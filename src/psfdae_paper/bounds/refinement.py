@@ -26,10 +26,15 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
+from psfdae.optics.pupil import choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
 from psfdae.sensing.climbing import poisson_information
 from psfdae.stars.noise import NoiseModel
-from psfdae_paper.bounds.posterior_network import PosteriorNetwork, WavefrontCoordinates
+from psfdae_paper.bounds.posterior_network import (
+    PosteriorNetwork,
+    WavefrontCoordinates,
+    WavefrontNetwork,
+)
 
 
 @dataclass(frozen=True)
@@ -212,33 +217,47 @@ class Expansion:
 
 
 class NetworkStarts(NamedTuple):
-    """Results of a network from which wavefronts are refined.
+    """Results of networks from which wavefronts are refined.
 
     Attributes
     ----------
     points : ndarray, shape (n, K, 8)
         Coefficients of K wavefronts of each star, the most likely first.
+    precision : ndarray, shape (n, K, 8, 8)
+        Inverse covariances of their errors.
+    weight : ndarray, shape (n, K)
+        Their probabilities.
     psf, variance : ndarray, shape (n, P)
         PSF of the network, and its variance.
     """
 
     points: np.ndarray
+    precision: np.ndarray
+    weight: np.ndarray
     psf: np.ndarray
     variance: np.ndarray
 
     @classmethod
     def compute(
-        cls, network: PosteriorNetwork, noisy: np.ndarray, level: np.ndarray, pixel: float
+        cls,
+        network: PosteriorNetwork,
+        proposer: WavefrontNetwork,
+        noisy: np.ndarray,
+        level: np.ndarray,
+        pixel: float,
     ) -> NetworkStarts:
-        """Apply a network to images (n, d, d) of levels (n,); `pixel` is its width in λ/D."""
-        estimate = network.estimate(noisy, level, None)
-        order = np.argsort(-estimate.log_weight, axis=1)
-        wavefront = np.take_along_axis(estimate.wavefront, order[:, :, None], axis=1)
+        """Apply networks to images (n, d, d) of levels (n,); `pixel` is its width in λ/D."""
+        estimate, pixels = network.estimate(noisy, level, None), len(network.mean)
         psf, sigma = (
-            values.reshape(len(noisy), -1).astype(np.float64)
+            np.asarray(values, np.float64).reshape(len(noisy), pixels)
             for values in (estimate.psf, estimate.sigma)
         )
-        return cls(WavefrontCoordinates.decode(wavefront, pixel), psf, sigma**2)
+        log_weight, wavefront, root = proposer.propose(noisy, level)
+        # The precision of coordinates T c is RᵀR, the precision of c is (RT)ᵀRT.
+        root = root @ WavefrontCoordinates.to_coordinates
+        precision = root.swapaxes(2, 3) @ root
+        points = WavefrontCoordinates.decode(wavefront, pixel)
+        return cls(points, precision, np.exp(log_weight), psf, sigma**2)
 
 
 class RefinedPsfs(NamedTuple):
@@ -248,10 +267,14 @@ class RefinedPsfs(NamedTuple):
     ----------
     psf, variance : ndarray, shape (n, P)
         Mean and variance of the noise-free stamp.
+    evidence : ndarray, shape (n,)
+        Logarithm of the integral of prior × likelihood about the wavefronts, relative to the
+        likelihood of a star with the counts of the image.
     """
 
     psf: np.ndarray
     variance: np.ndarray
+    evidence: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -270,11 +293,17 @@ class Refiner:
         Photon noise of the images.
     max_steps : int
         Maximum number of expansions of a climb, at least two.
+    damping : float
+        Factor of the inverse covariances of starts, by which the first step is damped.
     min_gain : float
         A climb ends where the next step would raise the logarithm of the posterior by less.
-    max_distance : float
-        Mean squared difference between a refined PSF and the network's, in units of the sum of
-        their variances, above which the next proposal is tried.
+    max_proposals : int
+        Maximum number of proposals that are tried.
+    min_weight : float
+        Total probability of the others, above which the next proposal is tried.
+    max_gap : float
+        Difference in the logarithm of the evidence of first expansions, below which a proposal is
+        refined.
     fields_kept : int
         Fields that expansions after the first one consider, the most likely of the first.
     batch : int
@@ -287,14 +316,19 @@ class Refiner:
     noise: NoiseModel
     max_steps: ClassVar[int] = 3
     min_gain: ClassVar[float] = 1.0
-    max_distance: ClassVar[float] = 1.2
+    damping: ClassVar[float] = 0.25
+    max_proposals: ClassVar[int] = 4
+    min_weight: ClassVar[float] = 0.1
+    max_gap: ClassVar[float] = 6.0
     fields_kept: ClassVar[int] = 24
-    batch: ClassVar[int] = 256
+    batch: ClassVar[int] = 128
+    sampling: ClassVar[float] = 0.85
+    """Factor of the pupil samples that `SampledStamps` would choose."""
     pupil_samples: ClassVar[tuple[int, ...]] = (
         *(32, 40, 48, 56, 64, 72, 80, 88, 96, 108, 120, 132, 144, 158),
         *(190, 222, 254, 318, 398, 478, 574, 690, 830, 1000),
     )
-    """Pupil grids, of which a wavefront uses the smallest one that its slopes allow."""
+    """Pupil grids, of which a wavefront uses the smallest one with enough samples."""
 
     @cached_property
     def _operator(self) -> SampledStamps:
@@ -311,7 +345,12 @@ class Refiner:
         )
 
     def expand(
-        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
+        self,
+        point: np.ndarray,
+        counts: np.ndarray,
+        flux: np.ndarray,
+        fields: np.ndarray,
+        damping: np.ndarray | float = 0.0,
     ) -> Expansion:
         """Expand the posteriors of n stars about wavefronts.
 
@@ -325,9 +364,15 @@ class Refiner:
             Photons F of each star.
         fields : ndarray of int, shape (n, f)
             Fields that are considered for each star.
+        damping : ndarray, shape (n, 8, 8)
+            Inverse covariance of a normal distribution about the points, another factor of the
+            posterior.
         """
         axes = np.broadcast_to(np.eye(len(MONOMIALS)), (len(point), *[len(MONOMIALS)] * 2))
-        raw = self._operator.derivatives(point, axes)
+        # The count of samples holds for the steepest slopes, which few rays have.
+        samples = np.ceil(self.sampling * self._operator.samples(point)).astype(int)
+        samples = choose_samples(samples, self.pupil_samples)
+        raw = self._operator.derivatives(point, axes, samples=samples)
         stamps, slopes, _ = normalise_with_derivatives(*raw)
         stamps = stamps.reshape(len(point), -1).astype(np.float64)
         slopes = slopes.reshape(len(point), len(MONOMIALS), -1).astype(np.float64)
@@ -337,81 +382,95 @@ class Refiner:
             flux[:, None] * stamps + self.noise.background,
             flux[:, None, None] * slopes,
         )
-        components = self.prior.condition(point, score, information, fields)
+        components = self.prior.condition(point, score, information + damping, fields)
         return Expansion(point, stamps, slopes, deviance, information, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
         """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
 
-        A star's proposals are refined one after the other until a stamp is near the network's PSF.
+        Proposals are tried up to a total probability, and refined unless the first expansion of
+        another one has much more evidence.
         """
-        count = len(noisy)
+        count, pixels = len(noisy), self.stamp_px**2
         flux = self.noise.flux(level)
         # Counts are whole numbers: rounding undoes the loss of the images' single precision.
-        images = noisy.reshape(count, -1).astype(np.float64)
+        images = noisy.reshape(count, pixels).astype(np.float64)
         counts = np.rint(flux[:, None] * images) + self.noise.background
-        shape = starts.points.shape[:2]
-        psf, variance = np.zeros((2, *shape, images.shape[1]))
-        evidence = np.full(shape, -np.inf)
-        open_stars = np.arange(count)
-        for k in range(shape[1]):
-            # Derivatives of a batch of stars fit in the cache.
-            for first in range(0, open_stars.size, self.batch):
-                stars = open_stars[first : first + self.batch]
-                peaks = self.climb(starts.points[stars, k], counts[stars], flux[stars])
-                psf[stars, k], variance[stars, k], evidence[stars, k] = peaks
-            distance = (psf[open_stars, k] - starts.psf[open_stars]) ** 2
-            distance /= starts.variance[open_stars] + variance[open_stars, k]
-            open_stars = open_stars[distance.mean(axis=1) > self.max_distance]
-        # Means over the wavefronts of a star, with their posterior probabilities.
-        weight = np.exp(evidence - evidence.max(axis=1, keepdims=True))
-        weight = (weight / weight.sum(axis=1, keepdims=True))[:, :, None]
-        mean = (weight * psf).sum(axis=1)
-        variance += (psf - mean[:, None]) ** 2
-        return RefinedPsfs(mean, (weight * variance).sum(axis=1))
+        psf, variance = np.zeros((2, count, pixels))
+        evidence = np.full(count, -np.inf)
+        # Proposals that are preceded by less than the total probability.
+        is_likely = np.cumsum(starts.weight, axis=1) - starts.weight < 1.0 - self.min_weight
+        is_likely[:, self.max_proposals :] = False
+        for first in range(0, count, self.batch):
+            star, number = np.nonzero(is_likely[first : first + self.batch])
+            star += first
+            start = starts.points[star, number], self.damping * starts.precision[star, number]
+            first_evidence, point, fields = self.begin(*start, counts[star], flux[star])
+            best_evidence = np.full(count, -np.inf)
+            np.maximum.at(best_evidence, star, first_evidence)
+            is_near = first_evidence >= best_evidence[star] - self.max_gap
+            star = star[is_near]
+            peaks = self.climb(point[is_near], fields[is_near], counts[star], flux[star])
+            # Means over the wavefronts of a star, with their posterior probabilities.
+            np.logaddexp.at(evidence, star, peaks.evidence)
+            weight = np.exp(peaks.evidence - evidence[star])[:, None]
+            np.add.at(psf, star, weight * peaks.psf)
+            np.add.at(variance, star, weight * (peaks.variance + (peaks.psf - psf[star]) ** 2))
+        return RefinedPsfs(psf, variance, evidence)
 
-    def climb(
-        self, start: np.ndarray, counts: np.ndarray, flux: np.ndarray
+    def begin(
+        self, point: np.ndarray, damping: np.ndarray, counts: np.ndarray, flux: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Move wavefronts to maxima of the posterior, and expand it there.
+        """Make a first, damped step from n wavefronts.
 
         Parameters
         ----------
-        start : ndarray, shape (n, 8)
+        point : ndarray, shape (n, 8)
             Coefficients at which the climbs begin.
+        damping : ndarray, shape (n, 8, 8)
+            Inverse covariances that limit the step.
         counts, flux : ndarray, shapes (n, P) and (n,)
             Photons of the pixels, and of the star.
 
         Returns
         -------
-        psf, variance : ndarray, shape (n, P)
-            Posterior mean and variance of the stamp.
         evidence : ndarray, shape (n,)
-            Logarithm of the integral of prior × likelihood.
+            Logarithm of the integral of prior × likelihood, by the first expansion.
+        point : ndarray, shape (n, 8)
+            Next coefficients.
+        fields : ndarray of int, shape (n, f)
+            The most likely fields.
         """
         every_field = np.arange(len(self.prior.field))
-        fields = np.broadcast_to(every_field, (len(start), every_field.size))
+        fields = np.broadcast_to(every_field, (len(point), every_field.size))
+        expansion = self.expand(point, counts, flux, fields, damping)
+        components = expansion.components
+        # The most likely fields, by the best offset of each.
+        log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
+        number = min(self.fields_kept, every_field.size)
+        likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
+        return expansion.evidence, point + components.mode, likely
+
+    def climb(
+        self, point: np.ndarray, fields: np.ndarray, counts: np.ndarray, flux: np.ndarray
+    ) -> RefinedPsfs:
+        """Move wavefronts (n, 8) to maxima of the posterior, and expand it there.
+
+        For the parameters see `begin` and its result.
+        """
         psf, variance = np.empty((2, *counts.shape))
-        evidence, stars, point = np.empty(len(start)), np.arange(len(start)), start
-        for step in range(self.max_steps):
-            expansion = self.expand(point, counts[stars], flux[stars], fields)
-            is_last = np.full(len(stars), step + 1 == self.max_steps)
-            if step:
-                is_last |= expansion.gain < self.min_gain
+        evidence, stars = np.empty(len(point)), np.arange(len(point))
+        for step in range(1, self.max_steps):
+            expansion = self.expand(point, counts[stars], flux[stars], fields[stars])
+            is_last = expansion.gain < self.min_gain
+            is_last |= step + 1 == self.max_steps
             if is_last.any():
                 psf[stars[is_last]], variance[stars[is_last]] = expansion.moments(is_last)
                 evidence[stars[is_last]] = expansion.evidence[is_last]
-            # The most likely fields, by the best offset of each.
-            components = expansion.components
-            log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)[~is_last]
-            number = min(self.fields_kept, fields.shape[1])
-            likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
-            fields = np.take_along_axis(fields[~is_last], likely, axis=1)
-            point = (expansion.point + components.mode)[~is_last]
-            stars = stars[~is_last]
+            point, stars = (point + expansion.components.mode)[~is_last], stars[~is_last]
             if not stars.size:
                 break
-        return psf, variance, evidence
+        return RefinedPsfs(psf, variance, evidence)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ these only select the fields, and calibrate the standard deviations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 
@@ -29,6 +30,8 @@ from psfdae_paper.configuration.posterior_network import PosteriorNetworkSetting
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.posterior_network import PosteriorNetwork, PosteriorNetworkTraining
+
+Trained = TypeVar("Trained", bound="PosteriorNetworkTraining")
 
 
 class PosteriorNetworkMethod(Method):
@@ -56,8 +59,6 @@ class PosteriorNetworkMethod(Method):
                 "standard deviations that hold 95 % of the errors, at each level",
             ),
             "points": ("1", "field points along a side"),
-            "wavefront_mean": ("waves", "mean of the coordinates of wavefronts"),
-            "wavefront_sd": ("waves", "their standard deviations"),
             "input": ("1", "filters of the first layer"),
             "input_level": ("1", "weights of the noise level in the first layer"),
             "input_position": ("1", "weights of the position in the first layer"),
@@ -66,14 +67,11 @@ class PosteriorNetworkMethod(Method):
             "reduce": ("1", "weights of the second layer of each block"),
             "output": ("1", "filters of the PSF"),
             "output_sigma": ("1", "filters of the logarithm of the standard deviation"),
-            "output_wavefront": ("1", "weights of the proposals of wavefronts"),
         },
         diagnostics=(HISTORY,),
         per_reference=True,
     )
-    packing = None
     groups: ClassVar = {"posterior_network": PosteriorNetworkSettings}
-    proposes_wavefronts: ClassVar[bool] = False
 
     def __init__(
         self, network: PosteriorNetwork, history: list[dict[str, Any]] | None = None
@@ -99,9 +97,6 @@ class PosteriorNetworkMethod(Method):
             If the stars are not simulated with random aberrations, or the reference is their
             template.
         """
-        import torch
-
-        from psfdae.methods.networks import training as loop
         from psfdae_paper.bounds.posterior_network import PosteriorNetworkTraining
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
@@ -110,29 +105,40 @@ class PosteriorNetworkMethod(Method):
         if not data.simulation:
             raise FitError(f"{cls.name}: needs stars of a simulation, these come from an image")
         if data.reference != "realisation":
-            raise FitError(f"{cls.name}: restores noise-free stars, not reference={data.reference}")
+            raise FitError(f"{cls.name}: needs reference=realisation, not {data.reference}")
         config = part(SIMULATION, data.simulation)
         if isinstance(config.wavefront, VonKarman):
             raise FitError(
                 f"{cls.name}: needs stars with random aberrations; method static_posterior knows"
                 " the static PSFs of turbulence"
             )
-        torch.set_num_threads(posterior_network.threads)
+        begin = partial(
+            PosteriorNetworkTraining, data, config, posterior_network, cls.needs.position
+        )
+        assert data.checkpoint is not None
+        return cls.run(begin, data, posterior_network, data.checkpoint)
+
+    @classmethod
+    def run(
+        cls,
+        begin: Callable[[int], Trained],
+        data: TrainingSet,
+        settings: PosteriorNetworkSettings,
+        checkpoint: Path,
+    ) -> Trained:
+        """Run a training, from its checkpoint if it has the same settings and data."""
+        from psfdae.methods.networks import training as loop
+
         # Everything that determines the result.
         decisions = {
-            "settings": dump_deciding(posterior_network),
-            "simulation": config.model_dump(),
+            "settings": dump_deciding(settings),
+            "simulation": dict(data.simulation),
             "name": cls.name,
             "noise": [data.levels.tolist(), str(data.noise)],
         }
         digest = loop.fingerprint(decisions, data.images, data.validation, data.positions)
-        with loop.progress(posterior_network.epochs) as report:
-            assert data.checkpoint is not None
-            kind = cls.needs.position, cls.proposes_wavefronts
-            begin = partial(PosteriorNetworkTraining, data, config, posterior_network, *kind)
-            training = loop.train(begin, data.checkpoint, digest, report)
-        assert isinstance(training, PosteriorNetworkTraining)
-        return training
+        with loop.progress(settings.epochs) as report:
+            return cast("Trained", loop.train(begin, checkpoint, digest, report))
 
     def estimate(
         self,

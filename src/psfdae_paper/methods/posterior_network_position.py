@@ -11,3 +11,4 @@ class PlacedPosteriorNetwork(PosteriorNetworkMethod):
 
     look = Look("posterior network", "#44aa99", "H", is_drawn=False)
     needs = Needs(level=True, position=True, validation=True, memory_mb=2000, minutes=60)
+    packing = None

@@ -1,7 +1,8 @@
 """Method `posterior_network_refined`: a network whose wavefronts the optics refine.
 
-The posterior network proposes the wavefront of a star besides its PSF. Gauss–Newton steps on the
-stamp of the telescope refine it (`psfdae_paper.bounds.refinement`). Where the image determines the
+A second network, which continues the training of the posterior network, proposes wavefronts of a
+star. Gauss–Newton steps on the stamp of the telescope refine them
+(`psfdae_paper.bounds.refinement`). Where the image determines the
 wavefront, the posterior mean about it has nearly the minimum error; elsewhere the network is
 better. The result is a mean of both, weighted by their variances and the misfit of the wavefront.
 """
@@ -9,6 +10,7 @@ better. The result is a mean of both, weighted by their variances and the misfit
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -16,21 +18,40 @@ import numpy as np
 from psfdae.methods.interface import Estimate, FitError, Look, Needs, Storage, TrainingSet
 from psfdae.stars.noise import build_noise
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
+from psfdae_paper.methods import PhotonMethod
 from psfdae_paper.methods.posterior_network import PosteriorNetworkMethod
 
 if TYPE_CHECKING:
-    from psfdae_paper.bounds.posterior_network import PosteriorNetwork
-    from psfdae_paper.bounds.refinement import Combination, Refiner
-    from psfdae_paper.configuration.schema import Config
+    from psfdae_paper.bounds.posterior_network import PosteriorNetwork, WavefrontNetwork
+    from psfdae_paper.bounds.refinement import (
+        Combination,
+        NetworkStarts,
+        RefinedPsfs,
+        Refiner,
+    )
 
 
-class RefinedPosteriorNetwork(PosteriorNetworkMethod):
+PROPOSER = {
+    **{
+        name: PosteriorNetworkMethod.list_arrays()[name]
+        for name in ("input", "input_level", "expand", "expand_level", "reduce")
+    },
+    "coordinate_mean": ("waves", "mean of the coordinates of wavefronts"),
+    "coordinate_sd": ("waves", "their standard deviations"),
+    "output": ("1", "weights of mixtures of wavefronts"),
+}
+"""Arrays of the network of wavefronts alone; their names in files begin with `wavefront_`."""
+
+
+class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
     """Trained network, optics of the telescope, and weights of both.
 
     Parameters
     ----------
     network : PosteriorNetwork
-        Trained network.
+        Trained network of PSFs.
+    proposer : WavefrontNetwork
+        Trained network of wavefronts.
     refiner : Refiner
         Optics with the prior of the aberrations.
     combination : Combination
@@ -44,6 +65,7 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
     storage = Storage(
         arrays={
             **PosteriorNetworkMethod.list_arrays(),
+            **{f"wavefront_{name}": fact for name, fact in PROPOSER.items()},
             "seidel_mean": ("waves", "mean of the Seidel coefficients"),
             "seidel_sd": ("waves", "their standard deviations"),
             "relative_field": ("1", "field vectors, 1 at the edge on an axis"),
@@ -56,24 +78,17 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
         diagnostics=PosteriorNetworkMethod.storage.diagnostics,
         per_reference=True,
     )
-    assumes_independent_pixels = True
-    proposes_wavefronts = True
 
     def __init__(
         self,
         network: PosteriorNetwork,
+        proposer: WavefrontNetwork,
         refiner: Refiner,
         combination: Combination,
         history: list[dict[str, Any]] | None = None,
     ) -> None:
         super().__init__(network, history)
-        self.refiner, self.combination = refiner, combination
-
-    @classmethod
-    def check(cls, config: Config) -> None:
-        """Raise ConfigError if it is used with other noise than Poisson noise, its likelihood."""
-        if cls.name in config.methods:
-            config.noise.require_poisson(f"methods: {cls.name} is")
+        self.proposer, self.refiner, self.combination = proposer, refiner, combination
 
     @classmethod
     def fit(cls, data: TrainingSet, posterior_network: PosteriorNetworkSettings) -> Self:
@@ -86,25 +101,46 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
             template.
         """
         from psfdae_paper.bounds.estimates import build_stamp_model
-        from psfdae_paper.bounds.refinement import Combination, NetworkStarts, Refiner, SeidelPrior
+        from psfdae_paper.bounds.posterior_network import WavefrontTraining
+        from psfdae_paper.bounds.refinement import Combination, Refiner, SeidelPrior
 
         if data.simulation and data.simulation["scene"]["name"] != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         training = cls.train(data, posterior_network)
+        network, history = training.finish(), training.history
+        # The second training has a checkpoint beside the one of the first.
+        begin = partial(WavefrontTraining, data, training.config, posterior_network, network)
+        assert data.checkpoint is not None
+        checkpoint = data.checkpoint.with_suffix(".wavefront.pt")
+        proposer_training = cls.run(begin, data, posterior_network, checkpoint)
+        checkpoint.unlink(missing_ok=True)
+        # Its epochs and times follow the first training.
+        latest = {key: history[-1][key] for key in ("epoch", "step", "seconds", "cpu_seconds")}
+        for row in proposer_training.history:
+            history.append({key: value + latest.get(key, 0) for key, value in row.items()})
         model = build_stamp_model(training.config)
         prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
         optics = model.telescope.obscuration, model.framing.stamp_px
         refiner = Refiner(prior, *optics, data.noise)
-        network, stars = training.finish(), training.draw_fresh_stars()
+        stars = training.draw_fresh_stars()
         # Every star at every noise level.
         count, levels = len(stars.stamps), np.sort(data.levels)
         truth, level = np.tile(stars.stamps, (len(levels), 1)), np.repeat(levels, count)
         images = truth.reshape(-1, *data.images.shape[1:])
         noisy = data.noise.draw(images, level, training.stream("combination"))
-        starts = NetworkStarts.compute(network, noisy, level, prior.pixel)
-        posteriors = refiner.refine(noisy, level, starts)
-        combination = Combination.fit(level, starts, posteriors, truth)
-        return cls(network, refiner, combination, training.history)
+        # The combination is fitted to the results of the networks and of the optics.
+        blank = Combination(levels, *np.zeros((3, len(levels))))
+        refined = cls(network, proposer_training.model, refiner, blank, history)
+        refined.combination = Combination.fit(level, *refined.refine(noisy, level), truth)
+        return refined
+
+    def refine(self, noisy: np.ndarray, level: np.ndarray) -> tuple[NetworkStarts, RefinedPsfs]:
+        """Return the results of the networks, and of the optics, for images (n, d, d)."""
+        from psfdae_paper.bounds.refinement import NetworkStarts
+
+        pixel = self.refiner.prior.pixel
+        starts = NetworkStarts.compute(self.network, self.proposer, noisy, level, pixel)
+        return starts, self.refiner.refine(noisy, level, starts)
 
     def estimate(
         self,
@@ -114,13 +150,12 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
         with_sigma: bool = True,
     ) -> Estimate:
         """Return PSFs of sum 1 and the standard deviation of each pixel."""
-        from psfdae_paper.bounds.refinement import NetworkStarts
-
         levels = np.broadcast_to(np.asarray(level, np.float64), len(noisy))
-        starts = NetworkStarts.compute(self.network, noisy, levels, self.refiner.prior.pixel)
-        posteriors = self.refiner.refine(noisy, levels, starts)
-        psf, sigma = self.combination.combine(levels, starts, posteriors)
-        return Estimate(psf.reshape(noisy.shape), sigma.reshape(noisy.shape))
+        starts, refined = self.refine(noisy, levels)
+        psf, sigma = self.combination.combine(levels, starts, refined)
+        # A star that no wavefront of the telescope explains has a small evidence.
+        images = psf.reshape(noisy.shape), sigma.reshape(noisy.shape)
+        return Estimate(*images, outlier_score=-2.0 * refined.evidence)
 
     @property
     def calibration(self) -> tuple[np.ndarray, np.ndarray]:
@@ -129,9 +164,10 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of network, optics and weights."""
-        prior = self.refiner.prior
+        prior, proposer = self.refiner.prior, self.proposer.to_arrays()
         return {
             **self.network.to_arrays(),
+            **{f"wavefront_{name}": proposer[name] for name in PROPOSER},
             "seidel_mean": prior.mean,
             "seidel_sd": prior.sd,
             "relative_field": prior.field,
@@ -147,7 +183,7 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """Return network and optics with the noise of the configuration."""
-        from psfdae_paper.bounds.posterior_network import PosteriorNetwork
+        from psfdae_paper.bounds.posterior_network import PosteriorNetwork, WavefrontNetwork
         from psfdae_paper.bounds.refinement import Combination, Refiner, SeidelPrior
 
         noise = build_noise(config["noise"])
@@ -157,4 +193,6 @@ class RefinedPosteriorNetwork(PosteriorNetworkMethod):
         refiner = Refiner(prior, float(arrays["obscuration"][0]), side, noise)
         names = ("levels", "combination", "combined_scale", "combined_ratio95")
         combination = Combination(*(arrays[name] for name in names))
-        return cls(PosteriorNetwork(arrays, noise), refiner, combination)
+        proposer = {**arrays, **{name: arrays[f"wavefront_{name}"] for name in PROPOSER}}
+        networks = PosteriorNetwork(arrays, noise), WavefrontNetwork(proposer, noise)
+        return cls(*networks, refiner, combination)

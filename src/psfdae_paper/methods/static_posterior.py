@@ -9,19 +9,17 @@ simulation of the stars, which only select the fields.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
-from psfdae.methods.interface import Estimate, FitError, Look, Method, Needs, TrainingSet
+from psfdae.methods.interface import Estimate, FitError, Look, Needs, TrainingSet
 from psfdae.stars.noise import NoiseModel
-
-if TYPE_CHECKING:
-    from psfdae_paper.configuration.schema import Config
+from psfdae_paper.methods import PhotonMethod
 
 
 @dataclass(frozen=True, eq=False)
-class StaticPosterior(Method):
+class StaticPosterior(PhotonMethod):
     """Sum over the static PSFs of a telescope.
 
     Attributes
@@ -36,16 +34,9 @@ class StaticPosterior(Method):
     needs = Needs(level=True)
     storage = None
     packing = None
-    assumes_independent_pixels = True
 
     static: np.ndarray
     noise: NoiseModel
-
-    @classmethod
-    def check(cls, config: Config) -> None:
-        """Raise ConfigError if it is used with other noise than Poisson noise, its likelihood."""
-        if cls.name in config.methods:
-            config.noise.require_poisson(f"methods: {cls.name} is")
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Self:

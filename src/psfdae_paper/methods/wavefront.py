@@ -19,7 +19,8 @@ import numpy as np
 
 from psfdae.base.rng import stream
 from psfdae.methods.gmm import GaussianMixture, Gmm
-from psfdae.methods.interface import Estimate, FitError, Look, Method, Needs, TrainingSet
+from psfdae.methods.interface import Estimate, FitError, Look, Needs, TrainingSet
+from psfdae_paper.methods import PhotonMethod
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.modes import Modes
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Wavefront(Method):
+class Wavefront(PhotonMethod):
     """Estimator that fits the telescope's wavefront to each star.
 
     Attributes
@@ -53,7 +54,6 @@ class Wavefront(Method):
     needs = Needs(level=True)
     storage = None
     packing = None
-    assumes_independent_pixels = True
     fallback: ClassVar = GaussianMixture
     bank_stars: ClassVar[int] = 32000
     draws_per_star: ClassVar[int] = 100
@@ -62,12 +62,6 @@ class Wavefront(Method):
     model: StampModel
     static: np.ndarray
     data: TrainingSet
-
-    @classmethod
-    def check(cls, config: Config) -> None:
-        """Raise ConfigError if it is used with other noise than Poisson noise, its likelihood."""
-        if cls.name in config.methods:
-            config.noise.require_poisson(f"methods: {cls.name} is")
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Self:

@@ -8,22 +8,28 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from scipy.stats import multivariate_normal
 
 from costs import load_points
 from psfdae.base.files import read_product
 from psfdae.base.settings import ConfigError, parse_settings
+from psfdae.denoise.bundle import read_bundle, write_bundle
+from psfdae.denoise.star_model import StarModel
 from psfdae.methods import method
 from psfdae.methods.interface import FitError
 from psfdae.methods.networks.training import Training
 from psfdae.optics.derivatives import PointSampling, SampledStamps
 from psfdae.optics.wavefronts import monomial_images
 from psfdae.stars.noise import CorrelatedNoise, GaussianNoise, NoiseModel
+from psfdae.training.packing import build_uncalibrated
 from psfdae.training.star_sets import training_set
 from psfdae_paper.bounds.posterior_network import (
     DrawnStars,
     FreshStars,
     PosteriorNetwork,
+    Proposals,
     WavefrontCoordinates,
+    WavefrontNetwork,
     list_representations,
     measure_statistics,
 )
@@ -45,9 +51,9 @@ WORDS = (
 WORDS += ("parts.train_stars=60", "parts.test_stars=30")
 
 
-def build(stamps, uses_position=False, wavefront=None):
-    wavefront = np.empty((len(stamps), 0)) if wavefront is None else wavefront
-    stars = DrawnStars(stamps.reshape(len(stamps), -1), np.zeros((len(stamps), 2)), wavefront)
+def build(stamps, uses_position=False):
+    count = len(stamps)
+    stars = DrawnStars(stamps.reshape(count, -1), np.zeros((count, 2)), np.empty((count, 0)))
     statistics = measure_statistics(stars, LEVELS, points=11)
     settings = parse_settings(PosteriorNetworkSettings, SIZES)
     rng = np.random.default_rng(0)
@@ -94,10 +100,9 @@ def test_coordinates_that_do_not_vary_are_standardised_to_0():
     rng = np.random.default_rng(2)
     stamps, wavefront = rng.random((50, 8, 8)), rng.standard_normal((50, 8))
     wavefront[:, 0] = 0.3
-    stars = DrawnStars(stamps.reshape(50, -1), np.zeros((50, 2)), wavefront)
-    statistics = measure_statistics(stars, LEVELS, points=11)
-    scaled = (wavefront - statistics["wavefront_mean"]) / statistics["wavefront_sd"]
-    assert scaled[:, 0] == pytest.approx(0.0, abs=1e-9)
+    proposer = WavefrontNetwork.begin(build(stamps), wavefront, rng)
+    scaled = (wavefront - proposer.coordinate_mean.numpy()) / proposer.coordinate_sd.numpy()
+    assert scaled[:, 0] == pytest.approx(0.0, abs=1e-4)
     assert scaled[:, 3].std() == pytest.approx(1.0)
 
 
@@ -106,10 +111,13 @@ def test_estimates_have_the_sum_1():
     stamps = rng.random((300, 8, 8))
     stamps /= stamps.sum(axis=(1, 2), keepdims=True)
     network = randomise(build(stamps))
-    psf, sigma, *_ = network.estimate(NOISE.draw(stamps, 5e-3, rng), np.full(300, 5e-3), None)
-    assert psf.std(axis=0).min() > 1e-4
-    assert psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
-    assert (sigma > 0).all()
+    noisy = NOISE.draw(stamps, 5e-3, rng)
+    estimate = network.estimate(noisy, np.full(300, 5e-3), None)
+    assert estimate.psf.std(axis=0).min() > 1e-4
+    assert estimate.psf.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
+    assert (estimate.sigma > 0).all()
+    # Without stars, none.
+    assert network.estimate(noisy[:0], np.empty(0), None).psf.shape == (0, 8, 8)
 
 
 def test_network_commutes_with_mirror_images(monkeypatch):
@@ -119,24 +127,61 @@ def test_network_commutes_with_mirror_images(monkeypatch):
     stamps[:, 1:, 1:] = rng.random((200, 7, 7))
     stamps /= stamps.sum(axis=(1, 2), keepdims=True)
     every = np.concatenate([mirror(stamps, symmetry) for symmetry in SYMMETRIES])
-    matrices = WavefrontCoordinates.mirror()
-    wavefronts = rng.standard_normal((200, 8)) @ matrices
-    network = randomise(build(every, uses_position=True, wavefront=wavefronts.reshape(-1, 8)))
+    network = randomise(build(every, uses_position=True))
     position = rng.integers(0, 11, (6, 2))
-    psf, sigma, wavefront, log_weight = network.estimate(stamps[:6], level, position)
-    assert np.abs(psf - psf[0]).max() > 1e-3
-    assert np.abs(wavefront - wavefront[0]).max() > 0.1
-    mean = network.wavefront_mean.numpy()
-    for symmetry, matrix in zip(SYMMETRIES, matrices, strict=True):
+    estimate = network.estimate(stamps[:6], level, position)
+    assert np.abs(estimate.psf - estimate.psf[0]).max() > 1e-3
+    for symmetry in SYMMETRIES:
         fields = symmetry.field(position @ [1, 11], 11)
         place = np.stack(np.divmod(fields, 11)[::-1], axis=1)
-        moved, moved_sigma, *modes = network.estimate(mirror(stamps[:6], symmetry), level, place)
-        assert moved == pytest.approx(mirror(psf, symmetry), abs=2e-6)
-        inner = mirror(sigma, symmetry)[:, 1:, 1:]
-        assert moved_sigma[:, 1:, 1:] == pytest.approx(inner, rel=1e-4)
-        # Wavefronts move with the star, their probabilities do not change.
-        assert modes[0] - mean == pytest.approx((wavefront - mean) @ matrix.T, abs=1e-5)
-        assert modes[1] == pytest.approx(log_weight, abs=1e-5)
+        moved = network.estimate(mirror(stamps[:6], symmetry), level, place)
+        assert moved.psf == pytest.approx(mirror(estimate.psf, symmetry), abs=2e-6)
+        inner = mirror(estimate.sigma, symmetry)[:, 1:, 1:]
+        assert moved.sigma[:, 1:, 1:] == pytest.approx(inner, rel=1e-4)
+
+
+def test_wavefronts_move_with_the_star(monkeypatch):
+    """A mirrored star has mirrored wavefronts with the same probabilities."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    rng, level = np.random.default_rng(5), np.full(6, 2e-3)
+    stamps = np.zeros((200, 8, 8))
+    stamps[:, 1:, 1:] = rng.random((200, 7, 7))
+    every = np.concatenate([mirror(stamps, symmetry) for symmetry in SYMMETRIES])
+    matrices = WavefrontCoordinates.mirror()
+    wavefronts = (rng.standard_normal((200, 8)) @ matrices).reshape(-1, 8)
+    proposer = randomise(WavefrontNetwork.begin(build(every), wavefronts, rng))
+    log_weight, wavefront, root = proposer.propose(stamps[:6], level)
+    precision = root.swapaxes(2, 3) @ root
+    assert np.abs(precision[..., 0, 3]).min() > 1e-3
+    assert np.abs(wavefront - wavefront[0]).max() > 0.1
+    assert (np.diff(log_weight, axis=1) <= 0).all()
+    assert np.exp(log_weight).sum(axis=1) == pytest.approx(1.0)
+    mean = proposer.coordinate_mean.numpy()
+    for symmetry, matrix in zip(SYMMETRIES, matrices, strict=True):
+        moved = proposer.propose(mirror(stamps[:6], symmetry), level)
+        assert moved[0] == pytest.approx(log_weight, abs=1e-5)
+        assert moved[1] - mean == pytest.approx((wavefront - mean) @ matrix.T, abs=1e-5)
+        moved_precision = moved[2].swapaxes(2, 3) @ moved[2]
+        assert moved_precision == pytest.approx(matrix @ precision @ matrix.T, rel=1e-3, abs=1e-3)
+
+
+def test_proposals_are_a_mixture_of_normal_distributions():
+    rng = np.random.default_rng(8)
+    log_weight = np.log([[0.3, 0.7]])
+    mean, log_sd = rng.standard_normal((2, 1, 2, 8))
+    couplings = np.zeros((1, 2, 64))
+    couplings[..., WavefrontNetwork.coupling_elements] = rng.standard_normal((1, 2, 26))
+    arrays = log_weight, mean, log_sd, couplings.reshape(1, 2, 8, 8)
+    proposals = Proposals(*(torch.from_numpy(array) for array in arrays))
+    root, wavefront = proposals.root.numpy()[0], rng.standard_normal((5, 8))
+    density = sum(
+        np.exp(log_weight[0, k])
+        * multivariate_normal(mean[0, k], np.linalg.inv(root[k].T @ root[k])).pdf(wavefront)
+        for k in range(2)
+    )
+    expected = np.log(density) + 4.0 * np.log(2.0 * np.pi)
+    many = Proposals(*(torch.from_numpy(np.repeat(array, 5, axis=0)) for array in arrays))
+    assert many.log_density(torch.from_numpy(wavefront)).numpy() == pytest.approx(expected)
 
 
 def test_representations_are_orthonormal():
@@ -234,6 +279,17 @@ def test_refined_network_is_saved_with_its_optics(product, tmp_path):
     loaded = kind.load(tmp_path / "fit.h5").estimate(noisy, level)
     assert loaded.psf == pytest.approx(estimate.psf, abs=1e-7)
     assert loaded.sigma == pytest.approx(estimate.sigma, rel=1e-4)
+    # Without stars, none.
+    assert fitted.estimate(noisy[:0], level[:0]).psf.shape == (0, 16, 16)
+    # A bundle measures flux and sky, too: a further error, but a small one.
+    settings = {**config.model_dump(), "split": "random"}
+    parts = product, "realisation", config, settings, "name", "MIT"
+    write_bundle(build_uncalibrated(fitted, *parts)[0], tmp_path / "m.psf.safetensors")
+    model = StarModel(read_bundle(tmp_path / "m.psf.safetensors"))
+    flux = NOISE.flux(1e-3)
+    prediction = model.predict(rng.poisson(flux * truth + NOISE.background), gain=1.0)
+    psf = prediction.psf / prediction.flux[:, None, None]
+    assert np.square(psf - truth).mean() < 0.3 * np.square(noisy - truth).mean()
     # Stars of turbulence, or with other noise than photons', have no such optics.
     turbulence = {**data.simulation, "scene": {"name": "turbulence"}}
     with pytest.raises(FitError, match="random Seidel aberrations"):
@@ -274,7 +330,7 @@ def test_stars_of_an_image_and_templates_are_rejected(product, tmp_path):
     static = load_stage(SIMULATION, ("dataset=dataset8",)).model_dump()
     with pytest.raises(FitError, match="method static_posterior"):
         kind.fit(replace(data, simulation=static), **kind.settings(config))
-    with pytest.raises(FitError, match="reference=template"):
+    with pytest.raises(FitError, match="needs reference=realisation, not template"):
         kind.fit(replace(data, reference="template"), **kind.settings(config))
 
 

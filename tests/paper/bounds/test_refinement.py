@@ -41,8 +41,9 @@ def build_refiner(model, fields=slice(None)):
 
 def propose(points, psf):
     """Proposals (n, K, 8), and a network whose PSFs have an RMS error of 0.001."""
-    psf = psf.reshape(len(psf), -1)
-    return NetworkStarts(points, psf, np.full_like(psf, 1e-6))
+    psf, precision = psf.reshape(len(psf), -1), np.zeros((*points.shape, 8))
+    weight = np.full(points.shape[:2], 1.0 / points.shape[1])
+    return NetworkStarts(points, precision, weight, psf, np.full_like(psf, 1e-6))
 
 
 def draw_stars(model, count, seed):
@@ -146,6 +147,20 @@ def test_a_second_proposal_is_used_where_the_first_one_fails(model):
     assert errors[1] == pytest.approx(errors[2], rel=0.2)
 
 
+def test_a_star_with_a_companion_has_little_evidence(model):
+    """Of a star alone, −2 ln of the evidence is near the number of pixels."""
+    stamps, *_, point = draw_stars(model, 40, 11)
+    companion = stamps + 0.3 * np.roll(stamps[::-1], 4, axis=2)
+    companion /= companion.sum(axis=(1, 2), keepdims=True)
+    refiner, level, rng = build_refiner(model), np.full(40, 1e-3), np.random.default_rng(12)
+    usual, strange = (
+        -2.0 * refiner.refine(NOISE.draw(p, level, rng), level, propose(point[:, None], p)).evidence
+        for p in (stamps, companion)
+    )
+    assert 200 < np.median(usual) < 350
+    assert np.mean(strange > np.quantile(usual, 0.95)) > 0.8
+
+
 def test_refined_wavefront_is_the_maximum_of_the_posterior(model, monkeypatch):
     """In its field, at little noise, the refined PSF is the stamp of the climb's mode."""
     stamps, z, field, offset, point = draw_stars(model, 12, 6)
@@ -179,8 +194,9 @@ def test_a_combination_is_better_than_network_and_optics():
     is_wrong = np.arange(count) % 10 == 0
     refined[is_wrong] += 50.0
     ones = np.ones_like(truth)
-    starts = NetworkStarts(np.empty((count, 1, 8)), network, sd_network**2 * ones)
-    posterior = RefinedPsfs(refined, sd_refined**2 * ones)
+    no_points = np.empty((count, 1, 8)), np.empty((count, 1, 8, 8)), np.ones((count, 1))
+    starts = NetworkStarts(*no_points, network, sd_network**2 * ones)
+    posterior = RefinedPsfs(refined, sd_refined**2 * ones, np.zeros(count))
     level = np.repeat([1e-3, 3e-3], count // 2)
     combination = Combination.fit(level, starts, posterior, truth)
     psf, sigma = combination.combine(level, starts, posterior)
