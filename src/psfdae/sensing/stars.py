@@ -453,7 +453,7 @@ class WavefrontSearch:
             likelihood = poisson_information(photons.counts[stars], mean, slopes)
             return add_normal_prior(likelihood, parameters, self.prior_precision)
 
-        steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5, min_distance=1.0)
+        steps = Steps(max_steps=25, max_drop=40.0, relative_rounding=1e-5, min_distance=0.3)
         peaks = climb(evaluate, start, limit, steps, star)
         # Height = −½ (deviance + Σ x²/σ²).
         deviance = -2.0 * peaks.height - peaks.parameters**2 @ self.prior_precision
