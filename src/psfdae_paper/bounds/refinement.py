@@ -317,8 +317,8 @@ class Refiner:
     max_steps: ClassVar[int] = 3
     min_gain: ClassVar[float] = 1.0
     damping: ClassVar[float] = 0.25
-    max_proposals: ClassVar[int] = 4
-    min_weight: ClassVar[float] = 0.1
+    max_proposals: ClassVar[int] = 8
+    min_weight: ClassVar[float] = 0.05
     max_gap: ClassVar[float] = 6.0
     fields_kept: ClassVar[int] = 24
     batch: ClassVar[int] = 128
