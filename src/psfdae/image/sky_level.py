@@ -187,7 +187,7 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
     """
-    noise = np.full(image.shape, np.inf, np.float32)
+    noise = np.full(image.shape, np.inf, image.dtype)
     for top in range(0, len(image), 64):
         band, is_hidden = image[top : top + 64], bad[top : top + 64]
         # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
@@ -493,8 +493,12 @@ def _to_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
         )
         for pixels, count in zip(shape, coefficients.shape, strict=True)
     )
-    columns = (column_weights @ coefficients.T).T.astype(np.float32, order="C")
-    return np.asarray(row_weights.astype(np.float32) @ columns)
+    # A few rows at a time: products take twice the memory of the values.
+    columns = np.ascontiguousarray((column_weights @ coefficients.T).T)
+    values = np.empty(shape, np.float32)
+    for top in range(0, len(values), 64):
+        values[top : top + 64] = row_weights[top : top + 64] @ columns
+    return values
 
 
 # Structure within a mesh.
