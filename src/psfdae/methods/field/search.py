@@ -200,26 +200,14 @@ def _search_options(
     first_spacing : float
         Distance of knots at which the search begins.
     """
-    final_tolerance = options.tolerance
+    final_tolerance, finest = options.tolerance, options
     # Splines first, with a polynomial that follows most of the field: with splines that follow
     # noise, higher orders would not seem to pay. Orders up to 2 are all tried, because a symmetric
     # field has no slope.
     curved_order = 2
     first_order = max((o for o in orders if o <= curved_order), default=orders[0])
     options = replace(options, order=first_order, tolerance=fitter.settings.compared_tolerance)
-    # Distances of knots in six steps of √2, from the one on that is nearest to the first.
-    frame_px, knot_steps = len(fitter.axis), [options]
-    for _ in range(6):
-        spacing = 2.0**0.5 * compute_spacing(frame_px, knot_steps[-1].knots)
-        knot_steps.append(replace(options, knots=count_knots(frame_px, spacing)))
-    spacings = np.array([compute_spacing(frame_px, step.knots) for step in knot_steps])
-    first = int(np.abs(np.log(spacings / first_spacing)).argmin())
-    comparison = _Comparison(fitter, fitter.fit(knot_steps[first]))
-    options = comparison.find_best(knot_steps, first)
-    # Splines ten times as smooth, at most three times.
-    options = comparison.find_best(
-        [replace(options, smoothness=10.0**k * options.smoothness) for k in range(4)]
-    )
+    comparison, options = _search_splines(fitter, options, first_spacing)
     # Orders from the lowest to the first one that does not pay.
     order_steps = [replace(options, order=order) for order in orders]
     options = order_steps[0]
@@ -239,7 +227,47 @@ def _search_options(
             break
         options = step
         coordinates.remove(step.star_terms[-1])
+    # A field that follows magnitude or colour may need finer splines than one that does not.
+    if options.star_terms:
+        options = replace(options, knots=finest.knots, smoothness=finest.smoothness)
+        _, options = _search_splines(fitter, options, first_spacing)
     return replace(options, tolerance=final_tolerance)
+
+
+def _search_splines(
+    fitter: FieldFitter, options: FitOptions, first_spacing: float
+) -> tuple[_Comparison, FitOptions]:
+    """Search the distance of knots, then the smoothness, that predict left-out stars best.
+
+    Parameters
+    ----------
+    fitter : FieldFitter
+        Stars of the fits.
+    options : FitOptions
+        The smallest distance of knots, and the smallest smoothness.
+    first_spacing : float
+        Distance of knots at which the search begins.
+
+    Returns
+    -------
+    comparison : _Comparison
+        Comparison at the centres of a fit with the first distance.
+    options : FitOptions
+        The best options.
+    """
+    # Distances of knots in six steps of √2, from the one on that is nearest to the first.
+    frame_px, knot_steps = len(fitter.axis), [options]
+    for _ in range(6):
+        spacing = 2.0**0.5 * compute_spacing(frame_px, knot_steps[-1].knots)
+        knot_steps.append(replace(options, knots=count_knots(frame_px, spacing)))
+    spacings = np.array([compute_spacing(frame_px, step.knots) for step in knot_steps])
+    first = int(np.abs(np.log(spacings / first_spacing)).argmin())
+    comparison = _Comparison(fitter, fitter.fit(knot_steps[first]))
+    options = comparison.find_best(knot_steps, first)
+    # Splines ten times as smooth, at most three times.
+    return comparison, comparison.find_best(
+        [replace(options, smoothness=10.0**k * options.smoothness) for k in range(4)]
+    )
 
 
 def refit_field(
