@@ -130,6 +130,23 @@ def test_growth_shows_the_slope_of_the_largest_images():
     assert labels[1] == ["train, slope 0.00", "photometry, slope 0.00"]
 
 
+def test_a_tool_that_fails_has_rows_without_costs(tmp_path, monkeypatch):
+    """The message says how many failed, even if nothing is left for the figure."""
+
+    def fail(*arguments):
+        raise click.ClickException("no such tool")
+
+    monkeypatch.setattr(image_costs, "measure_process", fail)
+    monkeypatch.setattr(image_costs, "extract_commit", lambda *arguments: image_costs.ROOT)
+    monkeypatch.setattr(image_costs, "list_peer_runs", lambda *arguments: [])
+    options = ["--fields", "128:20", "--growth", "", "--results", str(tmp_path)]
+    run = CliRunner().invoke(image_costs.compare_tools, options)
+    assert run.exit_code == 1
+    assert "4 of 4 commands failed" in run.output
+    table = pd.read_csv(tmp_path / "tables/benchmark_images.csv")
+    assert table["cpu_s"].isna().all() and (table["stars"] == 20).all() and len(table) == 4
+
+
 @pytest.mark.parametrize("text", ["512", "512:x", "512:0", "8:10"])
 def test_sizes_that_are_none_are_refused(text):
     options = ["--fields", text, "--results", "r"]

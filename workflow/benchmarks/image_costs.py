@@ -166,8 +166,10 @@ def compare_tools(image, against, fields, growth, results):
     wide = table.pivot_table("cpu_s", ["image", "step"], "tool", sort=False).reindex(columns=trees)
     ratios = (wide.psfdae / wide.iloc[:, 1]).dropna().round(2)
     print("CPU time over the earlier commit's:", ratios.to_string(), sep="\n")
-    if fields + growth:
-        write_png(apply_style(image_growth)(table), results / "figures/benchmark/images.png")
+    # Simulated images without a failure.
+    drawn = table[table["tool"] == "psfdae"].dropna()
+    if len(drawn):
+        write_png(apply_style(image_growth)(drawn), results / "figures/benchmark/images.png")
     if failures:
         raise click.ClickException(f"{failures} of {len(rows)} commands failed, see above")
 
@@ -237,7 +239,7 @@ def list_peer_runs(image, folder):
 def measure_process(words, folder, environment):
     """Return CPU seconds and peak memory in MB of a command and the processes that it starts.
 
-    A failure ends with its message. Of several processes the memory is that of the largest.
+    A failure ends with its message. Of several processes, the largest memory counts.
     """
     used, log = folder / "used", folder / "log"
     with log.open("w") as output:

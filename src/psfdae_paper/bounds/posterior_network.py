@@ -43,7 +43,7 @@ from psfdae_paper.bounds.estimates import simulate_fresh_stars
 from psfdae_paper.bounds.posterior import Bank, compute_symmetry_weights, list_jitters
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.stars.fields import number_fields, relative_field
 from psfdae_paper.stars.symmetry import SYMMETRIES
 
 POSITION_TERMS = 9
@@ -301,8 +301,10 @@ class Proposals(NamedTuple):
 
     def log_density(self, wavefront: torch.Tensor) -> torch.Tensor:
         """Return the log-density (n,) at coordinates (n, 8), without the constant of a Gaussian."""
-        # N is strictly triangular: the determinant of R is the product of 1 / s.
-        distance = self.root @ (wavefront[:, None] - self.mean)[..., None]
+        # N is strictly triangular: the determinant of R is the product of 1 / s. Products in
+        # half precision would lose the sums that an image determines best.
+        with torch.autocast("cpu", enabled=False):
+            distance = self.root @ (wavefront[:, None] - self.mean)[..., None]
         log_part = self.log_weight - self.log_sd.sum(dim=2) - 0.5 * distance.square().sum((2, 3))
         return torch.logsumexp(log_part, dim=1)
 
@@ -714,12 +716,6 @@ class WavefrontNetwork(FeatureNetwork):
         return log_weight[stars, order], mean[stars, order], root[stars, order]
 
 
-def number_fields(position: np.ndarray, points: int) -> np.ndarray:
-    """Return the numbers ix + P iy of fields, (n,), by their grid indices (ix, iy), (n, 2)."""
-    fields: np.ndarray = np.rint(position @ [1, points]).astype(int)
-    return fields
-
-
 def measure_statistics(stars: DrawnStars, levels: np.ndarray, points: int) -> dict[str, np.ndarray]:
     """Return the buffers of a network: mean, eigenvectors and variances of stamps; and others.
 
@@ -920,8 +916,8 @@ class WavefrontTraining(PosteriorNetworkTraining):
     data, config, settings
         See `PosteriorNetworkTraining`.
     network : PosteriorNetwork
-        Network of an earlier training with these settings, whose epochs this one continues: stars
-        and noise are others than there.
+        Network of an earlier training with these settings, whose epochs this one continues, with
+        further stars and other noise.
     attempt : int
         Not used: these networks do not die.
     """

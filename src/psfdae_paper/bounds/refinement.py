@@ -435,7 +435,7 @@ class Refiner:
         Returns
         -------
         evidence : ndarray, shape (n,)
-            Logarithm of the integral of prior × likelihood, by the first expansion.
+            Logarithm of the integral of prior × likelihood × damping, by the first expansion.
         point : ndarray, shape (n, 8)
             Next coefficients.
         fields : ndarray of int, shape (n, f)

@@ -16,6 +16,7 @@ import numpy as np
 from psfdae.methods.interface import Estimate, FitError, Look, Needs, TrainingSet
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.methods import PhotonMethod
+from psfdae_paper.stars.fields import number_fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +55,7 @@ class StaticPosterior(PhotonMethod):
         if data.simulation.get("scene", {}).get("name") != "turbulence":
             raise FitError(f"{cls.name}: needs stars without random aberrations (scene 2)")
         config = part(SIMULATION, data.simulation)
-        # Fields are numbered ix + P iy on a grid of P points a side.
-        numbers = np.rint(data.positions[data.train] @ [1, config.grid.points]).astype(int)
+        numbers = number_fields(data.positions[data.train], config.grid.points)
         return cls(propagate_static_psfs(config)[np.unique(numbers)], data.noise)
 
     def estimate(

@@ -21,6 +21,7 @@ from psfdae.base.rng import stream
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.methods.interface import Estimate, FitError, Look, Needs, TrainingSet
 from psfdae_paper.methods import PhotonMethod
+from psfdae_paper.stars.fields import number_fields
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.modes import Modes
@@ -233,5 +234,4 @@ class Wavefront(PhotonMethod):
         """Return the numbers of the stars' fields, (n,), if the method is given them."""
         if not self.needs.position or position is None:
             return None
-        # Fields are numbered ix + P iy on a grid of P points a side.
-        return np.asarray(np.rint(position @ [1, self.bank.points]), int)
+        return number_fields(position, self.bank.points)

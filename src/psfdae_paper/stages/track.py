@@ -429,8 +429,10 @@ def logger(checkpoint: Path) -> Callable[[Row], None]:
         stop the training.
     """
     database = Path(os.environ["PSFDAE_RESULTS"], "mlflow.db")
-    # Checkpoints are METHOD/DATASET/SPLIT-REFERENCE.pt and, of scene 3, alignment-NETWORK.pt.
-    source = os.path.relpath(checkpoint.with_suffix(""), database.with_name("checkpoints"))
+    # Checkpoints are METHOD/DATASET/SPLIT-REFERENCE.pt and, of scene 3, alignment-NETWORK.pt. A
+    # second training of the same fit has a further suffix, and replaces the first one.
+    stem = checkpoint.with_name(checkpoint.name.partition(".")[0])
+    source = os.path.relpath(stem, database.with_name("checkpoints"))
     source = source.replace("alignment-", "alignment/")
     is_shown = bool(server() or "SLURM_JOB_ID" not in os.environ) and "/" in source
     # MLflow's id of the run, and the last epoch that it has; "" before the first one.

@@ -35,6 +35,12 @@ def relative_field(grid: Grid) -> np.ndarray:
     return angle_deg / grid.edge_deg
 
 
+def number_fields(position: np.ndarray, points: int) -> np.ndarray:
+    """Return the numbers ix + P iy of fields, (n,), by their grid indices (ix, iy), (n, 2)."""
+    fields: np.ndarray = np.rint(position @ [1, points]).astype(int)
+    return fields
+
+
 def assign_fields(count: int, fields: int, rng: np.random.Generator) -> np.ndarray:
     """Return a field for every star: a random permutation of k mod `fields`, k < `count`.
 

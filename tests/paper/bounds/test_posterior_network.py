@@ -184,6 +184,19 @@ def test_proposals_are_a_mixture_of_normal_distributions():
     assert many.log_density(torch.from_numpy(wavefront)).numpy() == pytest.approx(expected)
 
 
+def test_densities_are_the_same_in_a_training_in_half_precision():
+    """Sums of coordinates may be known a thousand times better than each of them."""
+    generator = torch.Generator().manual_seed(9)
+    wavefront, error = torch.randn((2, 4, 8), generator=generator)
+    wavefront[:, 7] = wavefront[:, :6].sum(dim=1) + 1e-3 * error[:, 7]
+    log_sd, couplings = torch.zeros(4, 1, 8), torch.zeros(4, 1, 8, 8)
+    log_sd[..., 7], couplings[..., 7, :6] = float(np.log(1e-3)), -1.0
+    proposals = Proposals(torch.zeros(4, 1), torch.zeros(4, 1, 8), log_sd, couplings)
+    expected = proposals.log_density(wavefront)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert proposals.log_density(wavefront).numpy() == pytest.approx(expected.numpy(), abs=0.01)
+
+
 def test_representations_are_orthonormal():
     waves = list_representations()
     assert waves @ waves.T == pytest.approx(np.eye(8), abs=1e-12)

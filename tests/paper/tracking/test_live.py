@@ -8,7 +8,10 @@ from psfdae.methods.networks.training import listener
 from tracked_results import ALL, HISTORY
 
 
-@pytest.mark.parametrize("place", ["dae/dataset3/random-template.pt", "knee-1.pt"])
+@pytest.mark.parametrize(
+    "place",
+    ["dae/dataset3/random-template.pt", "dae/dataset3/random-template.wavefront.pt", "knee-1.pt"],
+)
 def test_epochs_appear_as_they_are_trained_and_the_finished_run_replaces_them(
     site, monkeypatch, place
 ):
