@@ -182,7 +182,10 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
                 level = float(np.median(values))
                 noise = float(remove_dither(robust_scatter(values), dither_variance))
                 if noise > 0:
-                    deviation[: len(band), column : column + square_px] = (square - level) / noise
+                    # Larger ones are of stars, and could leave the range of single precision.
+                    deviation[: len(band), column : column + square_px] = np.clip(
+                        (square - level) / noise, -1e6, 1e6
+                    )
                     levels.append(level)
                     noises.append(noise)
     if not levels:

@@ -109,7 +109,9 @@ def changing_model(training, name):
     bundle, coordinate = training.model.bundle, COORDINATES[name]
     arrays = dict(bundle.weights)
     splines = arrays["coefficients"].astype(float)
-    slope = 0.8 * (gaussian_filter(splines[0], 2.0) - splines[0])
+    # A filter of σ = 1 px; knots may be any distance apart.
+    sigma = 1.0 / training.model.method.model.spacing
+    slope = 0.8 * (gaussian_filter(splines[0], sigma) - splines[0])
     low, high = np.zeros((2, coordinate + 1))
     low[:2], high[:2] = arrays["low"][:2], arrays["high"][:2]
     low[coordinate], high[coordinate] = RANGES[name]

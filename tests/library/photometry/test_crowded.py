@@ -536,7 +536,6 @@ def test_errors_of_stars_on_a_halo_include_the_error_of_the_halo(sky, light, mid
     ("options", "message"),
     [
         (["x.txt"], "x.txt"),
-        (["o.csv", "--zero-point", "nan"], "--zero-point"),
         (["o.csv", "--reference", "far.csv"], "0 of its stars"),
         (["o.csv", "--residual", "o.csv"], "o.csv"),
     ],
