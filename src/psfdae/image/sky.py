@@ -22,7 +22,13 @@ import scipy
 from psfdae.image.fits_file import ImageFile, open_pixels
 from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, SkyStructure, noise_correlation, sky_level
-from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
+from psfdae.stars.moments import (
+    count_step,
+    dither,
+    remove_dither,
+    robust_scatter,
+    row_medians,
+)
 
 
 @dataclass(frozen=True)
@@ -308,14 +314,6 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
         warnings.simplefilter("ignore", AstropyUserWarning)  # bad pixels are no numbers
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
         values = SigmaClip(3.0, stdfunc="mad_std")(values, axis=1, masked=False)
-        level, noise = _row_medians(values), np.nanstd(values, axis=1, dtype=np.float64)
+        level, noise = row_medians(values), np.nanstd(values, axis=1, dtype=np.float64)
     level, noise = np.nan_to_num(level).astype(np.float64), np.nan_to_num(noise)
     return level, np.where(noise > 0, remove_dither(noise, dither_variance), 0.0)
-
-
-def _row_medians(values: np.ndarray) -> np.ndarray:
-    """Return the median (n,) of each row (n, m) without its NaN; NaN if all values are."""
-    # NaN are last in the order. A sort of all rows takes a tenth of the time of `np.nanmedian`.
-    values, count = np.sort(values, axis=1), np.count_nonzero(~np.isnan(values), axis=1)
-    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
-    return np.asarray(np.take_along_axis(values, middle, axis=1).mean(axis=1))

@@ -19,7 +19,13 @@ import numpy as np
 import scipy
 
 from psfdae.image.interpolation import fill_bad
-from psfdae.stars.moments import count_step, dither, remove_dither, robust_scatter
+from psfdae.stars.moments import (
+    count_step,
+    dither,
+    remove_dither,
+    robust_scatter,
+    row_medians,
+)
 
 
 class SkyStructure(NamedTuple):
@@ -71,7 +77,7 @@ def sky_level(
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
+    image : ndarray of float, shape (h, w)
         Finite pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -182,7 +188,7 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
+    image : ndarray of float, shape (h, w)
         Finite pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -193,13 +199,13 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
         # |x₁ − x₂| of neighbours in a row; the last pixel of a row is compared with the one before.
         difference = np.abs(np.diff(band, axis=1, append=band[:, -2:-1]))
         is_hidden = is_hidden | np.concatenate([is_hidden[:, 1:], is_hidden[:, -2:-1]], axis=1)
+        # A row for each mesh; NaN where pixels are ignored, and beyond the last row and column.
+        rows, width = band.shape
+        meshes = np.full((64, -(-width // 64) * 64), np.nan, difference.dtype)
+        meshes[:rows, :width] = np.where(is_hidden, np.nan, difference)
+        values = meshes.reshape(64, -1, 64).swapaxes(0, 1).reshape(-1, 64**2)
         # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ.
-        meshes = zip(*sort_meshes(difference, is_hidden, 64), strict=True)
-        medians = [
-            0.5 * (values[(count - 1) // 2] + values[count // 2]) if count else 0.0
-            for values, count in meshes
-        ]
-        sigma = 1.4826 / np.sqrt(2.0) * np.array(medians)
+        sigma = 1.4826 / np.sqrt(2.0) * row_medians(values)
         noise[top : top + 64] = np.repeat(np.where(sigma > 0, sigma, np.inf), 64)[: band.shape[1]]
     return noise
 
@@ -320,7 +326,7 @@ def _measure_sky(image: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.n
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
+    image : ndarray of float, shape (h, w)
         Finite pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -358,7 +364,7 @@ def measure_meshes(
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
+    image : ndarray of float, shape (h, w)
         Finite pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -376,8 +382,9 @@ def measure_meshes(
     level, noise = np.full((2, *(-(-side // mesh_px) for side in image.shape)), np.nan)
     for row, column in np.ndindex(level.shape):
         mesh = tuple(np.s_[n * mesh_px : (n + 1) * mesh_px] for n in (row, column))
-        # One row of the good pixels: SEP takes no mesh of which half is masked.
-        pixels = image[mesh][~bad[mesh]][None]
+        # One row of the good pixels: SEP takes no mesh of which half is masked. It computes in
+        # single precision, in which a level is compared with pixels below.
+        pixels = image[mesh][~bad[mesh]][None].astype(np.float32)
         if pixels.size <= 0.2 * mesh_px**2:
             continue
         background = sep.Background(pixels, bw=pixels.size, bh=1, fw=1, fh=1)
@@ -396,34 +403,6 @@ def measure_meshes(
         for values in (level, noise):
             values[~is_known] = np.average(values[is_known][index], axis=1, weights=1.0 / distance)
     return level, noise
-
-
-def sort_meshes(band: np.ndarray, bad: np.ndarray, mesh_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of each mesh in a row of meshes, sorted, and the number of good ones.
-
-    Parameters
-    ----------
-    band : ndarray, shape (r, w)
-        The pixels, r at most `mesh_px`.
-    bad : ndarray of bool, shape (r, w)
-        Pixels that are ignored.
-    mesh_px : int
-        Side of the meshes.
-
-    Returns
-    -------
-    values : ndarray, shape (n, mesh_px²)
-        Good pixels, ascending, and NaN after them.
-    count : ndarray of int, shape (n,)
-        Number of good pixels.
-    """
-    # The band in whole meshes; NaN are last in the order.
-    rows, width = band.shape
-    padded = np.full((mesh_px, -(-width // mesh_px) * mesh_px), np.nan, band.dtype)
-    padded[:rows, :width] = np.where(bad, np.nan, band)
-    values = padded.reshape(mesh_px, -1, mesh_px).swapaxes(0, 1).reshape(-1, mesh_px**2)
-    values.sort(axis=1)
-    return values, np.count_nonzero(~np.isnan(values), axis=1)
 
 
 def _extrapolate(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
@@ -576,7 +555,7 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int, reach_px: int = 24)
 
     Parameters
     ----------
-    image : ndarray, shape (h, w)
+    image : ndarray of float, shape (h, w)
         Finite pixels.
     bad : ndarray of bool, shape (h, w)
         Pixels that are ignored.
@@ -640,12 +619,12 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
         warnings.simplefilter("ignore", RuntimeWarning)  # of rows without good pixels
         # Step at each row: median over the columns, and the scatter about it.
         step_sizes = jumps(0, 3, lines)
-        middle = _row_medians(step_sizes)
-        spread = 1.4826 * _row_medians(np.abs(step_sizes - middle[:, None]))
+        middle = row_medians(step_sizes)
+        spread = 1.4826 * row_medians(np.abs(step_sizes - middle[:, None]))
         # Slope of the level per px: changes within 12 px on both sides, a pixel off the line. Of
         # two signs they are bad rows, not a slope.
-        slope_before = _row_medians(jumps(0, side, lines - side - 1))
-        slope_after = _row_medians(jumps(0, side, lines + side + 1))
+        slope_before = row_medians(jumps(0, side, lines - side - 1))
+        slope_after = row_medians(jumps(0, side, lines + side + 1))
         smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
         slope = np.where(slope_before * slope_after > 0, np.sign(slope_before) * smaller, 0.0)
         # Less the slope over 3 px. A difference of means of 3 px scatters by √(2/3) σ of a pixel.
@@ -662,7 +641,7 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
         for k in candidates[np.argsort(-np.abs(jump[candidates]))]:
             line, height_of_step = int(lines[k]), jump[k]
             eighths = [
-                _row_medians(part[None])[0] - (start + end) * slope[k]
+                row_medians(part[None])[0] - (start + end) * slope[k]
                 for start, end in ((0, 3), (3, side), (side, reach_px))
                 for part in np.array_split(jumps(start, end, np.array([line]))[0], 8)
             ]
@@ -671,9 +650,3 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
             if is_new and is_same.reshape(3, 8).mean(axis=1).min() >= 0.75:
                 steps.append(line)
     return steps
-
-
-def _row_medians(values: np.ndarray) -> np.ndarray:
-    """Return the median of each row (m, n) without its NaN; NaN if all values are."""
-    median = np.nanmedian if np.isnan(values).any() else np.median
-    return np.asarray(median(values, axis=1))

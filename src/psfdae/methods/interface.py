@@ -147,7 +147,7 @@ class Estimate:
     flux : ndarray, shape (n,), or None
         Flux of the star over the flux by which its image was divided, if the method measures it;
         the sum of the PSF is this ratio.
-    measured : Measured or None
+    measurements : Measurements or None
         Measurements of a method that measures stars itself; its PSFs have the sum 1.
     outlier_score : ndarray, shape (n,), or None
         See `Method.outlier_score`, if the method computes it together with the PSFs.

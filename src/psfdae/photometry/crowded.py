@@ -5,7 +5,7 @@ light of brighter ones, are then found where the models are subtracted
 (`psfdae.photometry.matched_filter`), and all are fitted again, on a sky without the light of stars,
 until no more are found, five times at most. Stars that were found there with a flux below 3 σ,
 which includes the errors of their neighbours' PSFs, are dropped. Stars of a list are where it has
-them, as accurately as its bright stars are (`list_places`). The light
+them, as accurately as its bright stars are (`locate_listed_stars`). The light
 that a star has beyond its stamp is measured with them (`psfdae.psf.wings`).
 """
 
@@ -154,28 +154,28 @@ def photometry(
     bad, cores = sky.bad | is_saturated, find_saturated_cores(is_saturated)
     sky = replace(sky, bad=bad)
     # Stars start where the list or the detection has them, with the wings of the model. `origin` is
-    # where a star was first expected, `place` where it was fitted last.
+    # where a star was first expected, `position` where it was fitted last.
     origin, flux = np.array(observation.positions, dtype=np.float64), None
-    place = origin
+    position = origin
     wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.signal, gain)
     # Positions of all stars that were found in residuals: each is tried once.
     peaks = np.empty((0, 2))
-    # Places by the list, and their error, as soon as its bright stars have shown it.
-    is_listed, place_prior = observation.detections is None, None
+    # Positions by the list, and their error, as soon as its bright stars have shown it.
+    is_listed, position_prior = observation.detections is None, None
     for turn in steps("photometry", range(turns)):
         # Centres move by at most a FWHM from where stars were expected.
         without_wings = image - sky.level - wing_light
         fit = fit_stars(
-            psfs, without_wings, error, bad, place, flux, box_px, fwhm, origin, place_prior
+            psfs, without_wings, error, bad, position, flux, box_px, fwhm, origin, position_prior
         )
         del without_wings, wing_light  # of a large image, each map takes much memory
-        place, flux = np.where(np.isfinite(fit.place), fit.place, place), fit.flux
-        place_prior = list_places(fit, origin, fwhm) if is_listed else None
+        position, flux = np.where(np.isfinite(fit.position), fit.position, position), fit.flux
+        position_prior = locate_listed_stars(fit, origin, fwhm) if is_listed else None
         # Sky and light beyond the stamps, from the image without the light of stars.
         earlier_level = sky.level
-        fluxes = StarFluxes(place, flux, psfs.outer_shares(place, flux, side))
+        fluxes = StarFluxes(position, flux, psfs.outer_shares(position, flux, side))
         # The first fluxes are off by the light of unknown wings: it is enough to know these to
         # their standard error, and to a tenth of it afterwards.
         sky, wing_light, wings, halo_error = around_stars(
@@ -195,7 +195,7 @@ def photometry(
         # Two fits at least; one more with halos, since the first fluxes contain their light, and
         # with the list of a crowd, if the sky of the first fit contained light of stars.
         is_changed = halo_error.any() or (
-            place_prior is not None
+            position_prior is not None
             and area_px * abs(np.mean(sky.level - earlier_level))
             > 0.2 * np.nanmedian(fit.flux_error)
         )
@@ -203,24 +203,24 @@ def photometry(
         if turn == turns - 1 or (may_be_last and is_listed):
             break
         # Stars that were found in residuals are dropped if they are none.
-        doubt = _psf_doubt(place, flux, side, area_px)
-        is_real = find_real(place, fit, doubt, observation.count, threshold, 0.5 * fwhm)
-        place, flux, origin = place[is_real], flux[is_real], origin[is_real]
+        doubt = _psf_doubt(position, flux, side, area_px)
+        is_real = find_real(position, fit, doubt, observation.count, threshold, 0.5 * fwhm)
+        position, flux, origin = position[is_real], flux[is_real], origin[is_real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
         # stars and find none.
         if not is_listed and turn < turns - 2:
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
-            known_places = np.concatenate([place, peaks])
-            new, new_flux = find_stars(psfs, sky.signal, sigma, known_places, threshold, fwhm)
-            place, origin, peaks = (np.concatenate([p, new]) for p in (place, origin, peaks))
+            known_positions = np.concatenate([position, peaks])
+            new, new_flux = find_stars(psfs, sky.signal, sigma, known_positions, threshold, fwhm)
+            position, origin, peaks = (np.concatenate([p, new]) for p in (position, origin, peaks))
             flux = np.append(flux, new_flux)
-        if may_be_last and is_real.all() and len(place) == len(is_real):
+        if may_be_last and is_real.all() and len(position) == len(is_real):
             break
     wings_used = choose_wings(wings, model.wings)
     # A halo that is off by δ in all pixels of a star changes its flux by δ Σ P / Σ P², which is δ
     # times the noise-equivalent area 1 / Σ P², as Σ P = 1.
     light_error = area_px * map_coordinates(
-        halo_error, np.nan_to_num(fit.place[:, ::-1]).T, order=1, mode="nearest"
+        halo_error, np.nan_to_num(fit.position[:, ::-1]).T, order=1, mode="nearest"
     )
     stars = tabulate_stars(model, psfs, observation, fit, origin, wings_used, fwhm, light_error)
     stars["flags"] |= star_flags(stars, bad & ~is_saturated, is_saturated, box_px, fwhm)
@@ -233,8 +233,10 @@ def photometry(
     )
 
 
-def list_places(fit: JointFit, origin: np.ndarray, fwhm: float) -> tuple[np.ndarray, float] | None:
-    """Return where a list expects stars in this image, (n, 2), and the error of these places, px.
+def locate_listed_stars(
+    fit: JointFit, origin: np.ndarray, fwhm: float
+) -> tuple[np.ndarray, float] | None:
+    """Return where a list expects stars in this image, (n, 2), and the error of that, px.
 
     A faint star in a crowd moves to a peak of the noise, or of its neighbours' light, if nothing
     but the pixels decides; where the list has it is better known from the bright stars. None if
@@ -245,14 +247,14 @@ def list_places(fit: JointFit, origin: np.ndarray, fwhm: float) -> tuple[np.ndar
     fit : JointFit
         All stars of the list.
     origin : ndarray, shape (n, 2)
-        Places by the list, x and y in pixels.
+        Positions by the list, x and y in pixels.
     fwhm : float
         FWHM of the PSF in pixels.
     """
     # Bright stars without a near neighbour, which would move the centre.
     is_bright = (fit.flux > 20.0 * fit.flux_error) & (fit.flags == 0)
-    is_bright[np.unique(pairs_within(fit.place, fwhm))] = False
-    offset = (fit.place - origin)[is_bright]
+    is_bright[np.unique(pairs_within(fit.position, fwhm))] = False
+    offset = (fit.position - origin)[is_bright]
     if len(offset) < 10:
         return None
     # Lists are less accurate for faint stars: at least the error that an image of the same depth
@@ -265,7 +267,7 @@ def list_places(fit: JointFit, origin: np.ndarray, fwhm: float) -> tuple[np.ndar
 
 
 def find_real(
-    place: np.ndarray,
+    position: np.ndarray,
     fit: JointFit,
     doubt: np.ndarray,
     listed_count: int,
@@ -279,7 +281,7 @@ def find_real(
 
     Parameters
     ----------
-    place : ndarray, shape (n, 2)
+    position : ndarray, shape (n, 2)
         Positions x and y, the stars of the list first.
     fit : JointFit
         These stars, as they were fitted.
@@ -293,19 +295,19 @@ def find_real(
         Distance within which two stars are one.
     """
     real = np.asarray(fit.flux > min(threshold, 3.0) * np.hypot(fit.flux_error, doubt))
-    real[find_duplicates(place, fit.flux, listed_count, distance_px)] = False
+    real[find_duplicates(position, fit.flux, listed_count, distance_px)] = False
     real[:listed_count] = True
     return real
 
 
 def find_duplicates(
-    place: np.ndarray, flux: np.ndarray, listed_count: int, distance_px: float
+    position: np.ndarray, flux: np.ndarray, listed_count: int, distance_px: float
 ) -> np.ndarray:
     """Return the indices of stars that have moved onto another star, which is kept.
 
     Parameters
     ----------
-    place : ndarray, shape (n, 2)
+    position : ndarray, shape (n, 2)
         Positions x and y; stars of the list, or of the first detection, come first.
     flux : ndarray, shape (n,)
         Of two stars that both were found in residuals, the fainter one is the duplicate.
@@ -314,7 +316,7 @@ def find_duplicates(
     distance_px : float
         Distance within which two stars are one.
     """
-    first, second = pairs_within(place, distance_px).T
+    first, second = pairs_within(position, distance_px).T
     # Of a pair, the star that comes later is the duplicate, or the fainter one if both were found.
     is_first = (first >= listed_count) & (flux[first] < flux[second])
     return np.asarray(np.where(is_first | (second < first), first, second))
@@ -357,7 +359,7 @@ def tabulate_stars(
     # negative: its PSF is known from its position.
     total_ratio, ratio_error = np.ones(len(fit.flux)), np.zeros(len(fit.flux))
     if wings is not None:
-        shares = psfs.outer_shares(fit.place, fit.flux, model.stamp_px)
+        shares = psfs.outer_shares(fit.position, fit.flux, model.stamp_px)
         total_ratio, ratio_error = wings.total_over_flux(shares)
     is_detected = observation.detections is not None
     # A centre that follows noise makes a detected star too bright (`JointFit.flux_bias`). With a
@@ -369,17 +371,17 @@ def tabulate_stars(
     # The errors of the PSF and of the wings are not noise, but the same fraction of each flux,
     # whatever its χ²: σ² = max(χ², 1) σ_noise² + σ_halo² + (e_model F)² + (e_wings F)², with the
     # relative errors e, for the flux F in the model; all light has the same relative error.
-    relative_error = np.hypot(model.flux_error(fit.place), ratio_error / total_ratio)
+    relative_error = np.hypot(model.flux_error(fit.position), ratio_error / total_ratio)
     # Stars of a list keep its numbers and flags.
     stars = Table({"id": np.arange(1, len(flux) + 1) if is_detected else observation.stars.id})
-    stars["x"], stars["y"] = fit.place.T
-    stars["x_error"], stars["y_error"] = excess * fit.place_error.T
+    stars["x"], stars["y"] = fit.position.T
+    stars["x_error"], stars["y_error"] = excess * fit.position_error.T
     stars["flux"] = total_ratio * flux
     fit_error = np.hypot(excess * fit.flux_error, light_error)
     stars["flux_error"] = total_ratio * np.hypot(fit_error, relative_error * flux)
     stars["flux_model"] = flux
     # Chains of neighbours, numbered from 1.
-    group = chains(fit.place, 2.4 * fwhm)
+    group = chains(fit.position, 2.4 * fwhm)
     stars["group"], stars["group_size"] = group + 1, np.bincount(group)[group]
     stars["chi2"], stars["photutils_flags"] = fit.chi2, fit.flags
     stars["flags"] = np.zeros(len(stars), np.uint16) if is_detected else observation.stars.flags
@@ -388,7 +390,7 @@ def tabulate_stars(
     faint = is_faint(np.array(stars["flux"]), np.array(stars["flux_error"]), 5.0)
     raise_flag(stars["flags"], StarFlag.FAINT, faint & is_detected)
     # Farther from where it was expected than noise explains, a star may be another one.
-    distance_px = np.hypot(*(fit.place - origin).T)
+    distance_px = np.hypot(*(fit.position - origin).T)
     sigma_px = np.hypot(stars["x_error"], stars["y_error"])
     is_far = distance_px > np.maximum(0.5 * fwhm, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
@@ -441,12 +443,12 @@ def star_flags(
     """
     from scipy.ndimage import maximum_filter
 
-    place = np.stack([stars["x"], stars["y"]], axis=1)
-    is_located = np.isfinite(place).all(axis=1)
+    position = np.stack([stars["x"], stars["y"]], axis=1)
+    is_located = np.isfinite(position).all(axis=1)
     flags, photutils = np.zeros(len(stars), np.uint16), np.array(stars["photutils_flags"])
     # Pixels of the box about each star; a star without a position is put off the image.
     height, width = bad.shape
-    column, row = np.rint(np.where(is_located[:, None], place, -box_px)).astype(int).T
+    column, row = np.rint(np.where(is_located[:, None], position, -box_px)).astype(int).T
     half = box_px // 2
     edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
     at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
@@ -460,11 +462,11 @@ def star_flags(
     # Flags of photutils: 8, the fit did not converge; 32, a position is at its bound.
     raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > MAX_CHI2) | (photutils & 8 > 0))
     raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
-    raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(place, fwhm)))
+    raise_flag(flags, StarFlag.BLENDED, np.unique(pairs_within(position, fwhm)))
     return flags
 
 
-def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
+def _psf_doubt(position: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
     """Return the flux (n,) that errors of the PSFs of other stars may cause at each star (n, 2).
 
     A PSF may lack 1.5 % of its light in and about its stamp of `side` pixels, of which a star gets
@@ -472,8 +474,8 @@ def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -
     """
     # Squares of the fluxes of all stars near enough to each star; both stars have light.
     has_light = (flux > 0)[:, None]
-    pairs = pairs_within(np.where(has_light, place, np.nan), 0.75 * side)
-    square = np.zeros(len(place))
+    pairs = pairs_within(np.where(has_light, position, np.nan), 0.75 * side)
+    square = np.zeros(len(position))
     for star, other in ((0, 1), (1, 0)):
         np.add.at(square, pairs[:, star], np.square(flux[pairs[:, other]]))
     return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))

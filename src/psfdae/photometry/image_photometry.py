@@ -81,7 +81,7 @@ def measure_all_stars(
     Parameters
     ----------
     model : FieldPsfs
-        Model that knows the PSF at every place of this image.
+        Model that knows the PSF at every position of this image.
     source : ImageInput
         The image with its options. With `detect`, its `origin` applies to the list of reference
         stars.
@@ -100,7 +100,7 @@ def measure_all_stars(
         If options exclude each other, the image is a cube, or fewer than three reference stars
         are stars of the image.
     PredictionError
-        If the model knows no PSF of a place, or has pixels of another scale.
+        If the model knows no PSF of a position, or has pixels of another scale.
     ObservationError
         If the image or a list cannot be used.
     """
@@ -117,7 +117,7 @@ def measure_all_stars(
     origin = source.origin
     if reference is not None and source.detect:
         source = replace(source, origin=None)
-    # The model must know the PSF at every place (`field_range` rejects others), and have pixels
+    # The model must know the PSF at every position (`field_range` rejects others), and have pixels
     # as large as the image's.
     model.field_range()
     # Progress is shown from here on: an image may take long to be opened.
@@ -319,7 +319,7 @@ def photometry_table(
     zero_point : float, optional
         Magnitude of a flux of 1; if None, the table lacks magnitudes.
     """
-    # Columns of the fit; magnitudes if the zero point is known, and places on the sky.
+    # Columns of the fit; magnitudes if the zero point is known, and positions on the sky.
     columns = {name: np.array(star_fit.stars[name]) for name in star_fit.stars.colnames}
     columns["flags"] = columns["flags"].astype(np.int32)  # FITS does not have unsigned integers
     with np.errstate(all="ignore"):

@@ -1,6 +1,6 @@
 """Positions and fluxes of all stars of an image from one weighted least-squares fit.
 
-The image x is the sum of the light of its stars, each a flux F times the PSF P at its place:
+The image x is the sum of the light of its stars, each a flux F times the PSF P at its position:
 
     x = Σ_i F_i P(p − p_i) + n,    n ~ N(0, σ²).
 
@@ -32,7 +32,7 @@ class JointFit:
 
     Attributes
     ----------
-    place, place_error : ndarray, shape (n, 2)
+    position, position_error : ndarray, shape (n, 2)
         Centres, x and y, 0-based pixels, and their standard errors.
     flux, flux_error : ndarray, shape (n,)
         Light in the stamp of the PSF, counts, and its standard errors.
@@ -46,8 +46,8 @@ class JointFit:
         Light of all stars, counts.
     """
 
-    place: np.ndarray
-    place_error: np.ndarray
+    position: np.ndarray
+    position_error: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
     flux_bias: np.ndarray
@@ -61,12 +61,12 @@ def fit_stars(
     image: np.ndarray,
     error: np.ndarray,
     bad: np.ndarray,
-    place: np.ndarray,
+    position: np.ndarray,
     flux: np.ndarray | None,
     box_px: int,
     range_px: float,
     origin: np.ndarray | None = None,
-    place_prior: tuple[np.ndarray, float] | None = None,
+    position_prior: tuple[np.ndarray, float] | None = None,
 ) -> JointFit:
     """Fit all stars of an image together.
 
@@ -78,8 +78,8 @@ def fit_stars(
         Image without its sky, and σ of its pixels, counts.
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
-    place : ndarray, shape (n, 2)
-        Start of the fit, x and y; stars whose place is not finite are not fitted.
+    position : ndarray, shape (n, 2)
+        Start of the fit, x and y; stars whose position is not finite are not fitted.
     flux : ndarray, shape (n,), or None
         Fluxes at the start, if known.
     box_px : int
@@ -87,17 +87,17 @@ def fit_stars(
     range_px : float
         Distance that a star may move from its origin along either axis.
     origin : ndarray, shape (n, 2), optional
-        Places of the stars by a list or by detection, by default where the fit starts.
-    place_prior : tuple of ndarray, shape (n, 2), and float, optional
-        Places that are known independently of this image, and their standard error along either
+        Positions of the stars by a list or by detection, by default where the fit starts.
+    position_prior : tuple of ndarray, shape (n, 2), and float, optional
+        Positions that are known independently of this image, and their standard error along either
         axis, px: the fit is the most probable one, given these. By default, pixels alone decide.
     """
-    fit = _Fit(psfs, image, error, bad, place, flux, min(box_px, psfs.side_px))
+    fit = _Fit(psfs, image, error, bad, position, flux, min(box_px, psfs.side_px))
     middle = fit.start if origin is None else origin[fit.stars]
-    # A place is known to its range: an even chance of ± a has the variance a²/3.
+    # A position is known to its range: an even chance of ± a has the variance a²/3.
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
-    if place_prior is not None:
-        fit.prior_place, fit.pull = place_prior[0][fit.stars], 1.0 / place_prior[1] ** 2
+    if position_prior is not None:
+        fit.prior_position, fit.pull = position_prior[0][fit.stars], 1.0 / position_prior[1] ** 2
         prior[1:] = fit.pull
     damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.cost()
     moving = np.ones(len(fit.stars), dtype=bool)
@@ -105,9 +105,9 @@ def fit_stars(
     for _ in steps("joint fit", range(15)):
         design = fit.design()
         step, gradient = fit.solve(design, prior, damping)
-        # No farther at once than the light is nearly linear in the place, and not out of its range.
+        # No farther at once than the light is nearly linear in the position, nor out of its range.
         move = np.clip(step[:, 1:], -range_px / 4, range_px / 4)
-        move = np.clip(fit.place + move, middle - range_px, middle + range_px) - fit.place
+        move = np.clip(fit.position + move, middle - range_px, middle + range_px) - fit.position
         step = np.column_stack([step[:, 0], move])
         # A group is at rest if its χ² would fall by less than 0.01: it is within 0.1 σ.
         expected_gain = np.bincount(group, (step * gradient).sum(axis=1))
@@ -126,34 +126,34 @@ def fit_stars(
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.cost() if len(back) else new_cost
-    bound = np.abs(fit.place - middle) > 0.999 * range_px
-    return fit.result(len(place), prior, moving, bound)
+    bound = np.abs(fit.position - middle) > 0.999 * range_px
+    return fit.result(len(position), prior, moving, bound)
 
 
-def pairs_within(place: np.ndarray, distance_px: float) -> np.ndarray:
+def pairs_within(position: np.ndarray, distance_px: float) -> np.ndarray:
     """Return the pairs of stars that are nearer to each other than a distance, (k, 2), by number.
 
-    Stars of which no place (n, 2) is known are in no pair.
+    Stars of which no position (n, 2) is known are in no pair.
     """
     from scipy.spatial import cKDTree
 
-    rows_with_place = np.flatnonzero(np.isfinite(place).all(axis=1))
+    rows_with_position = np.flatnonzero(np.isfinite(position).all(axis=1))
     # The tree numbers the located stars.
-    pairs = cKDTree(place[rows_with_place]).query_pairs(distance_px, output_type="ndarray")
-    return np.asarray(rows_with_place[pairs])
+    pairs = cKDTree(position[rows_with_position]).query_pairs(distance_px, output_type="ndarray")
+    return np.asarray(rows_with_position[pairs])
 
 
-def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
+def chains(position: np.ndarray, distance_px: float) -> np.ndarray:
     """Return the numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
 
-    A star of which no place (n, 2) is known is a chain of its own.
+    A star of which no position (n, 2) is known is a chain of its own.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     # Chains are the connected components of the graph of these pairs.
-    pairs = pairs_within(place, distance_px)
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(place),) * 2)
+    pairs = pairs_within(position, distance_px)
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(position),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])
 
 
@@ -172,7 +172,7 @@ class _Fit:
         image: np.ndarray,
         error: np.ndarray,
         bad: np.ndarray,
-        place: np.ndarray,
+        position: np.ndarray,
         flux: np.ndarray | None,
         box_px: int,
     ) -> None:
@@ -183,12 +183,12 @@ class _Fit:
         weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), side)
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
-        on_image = np.isfinite(place).all(axis=1)
-        on_image[on_image] = ((place[on_image] > -1) & (place[on_image] < (width, height))).all(
-            axis=1
-        )
+        on_image = np.isfinite(position).all(axis=1)
+        on_image[on_image] = (
+            (position[on_image] > -1) & (position[on_image] < (width, height))
+        ).all(axis=1)
         self.stars = np.flatnonzero(on_image)
-        self._middle = np.rint(place[self.stars]).astype(int)
+        self._middle = np.rint(position[self.stars]).astype(int)
         pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
         is_fitted = pixels >= self.parameters
         self.stars, self._middle, self.pixels = (
@@ -198,21 +198,21 @@ class _Fit:
         # are the pixels of all boxes.
         self.boxes = self._pixel_numbers(box_px)
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
-        # Places and fluxes at the start, the stars' light and its derivatives there.
+        # Positions and fluxes at the start, the stars' light and its derivatives there.
         self.weight = weight.ravel()[self.boxes]
-        self.start = place[self.stars].astype(np.float64)
-        self.place, self.flux = self.start.copy(), np.zeros(len(self.stars))
+        self.start = position[self.stars].astype(np.float64)
+        self.position, self.flux = self.start.copy(), np.zeros(len(self.stars))
         if flux is not None:
             self.flux = np.nan_to_num(flux[self.stars].astype(np.float64))
-        # Places that are known beforehand, and their inverse variance; 0 if none are.
-        self.prior_place, self.pull = self.start, 0.0
+        # Positions that are known beforehand, and their inverse variance; 0 if none are.
+        self.prior_position, self.pull = self.start, 0.0
         # A star moves so little that its PSF stays as it is at the start, of these fluxes.
         self._mix_splines()
         self._light = np.empty((len(self.stars), side, side), np.float32)
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         rows = np.arange(len(self.stars))
         self._draw(rows)
-        # Fluxes are linear in the pixels: those at the places of the start are one step away.
+        # Fluxes are linear in the pixels: those at the positions of the start are one step away.
         if flux is None:
             self.flux = self.solve_fluxes()
             # Where the PSF changes with the magnitude, these fluxes determine it from now on.
@@ -247,7 +247,7 @@ class _Fit:
                 splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
             else:
                 splines = self._splines[part]
-            stamps = self.psfs.stamps(self.place[part], corner, side, splines=splines)
+            stamps = self.psfs.stamps(self.position[part], corner, side, splines=splines)
             self._light[part] = stamps[:, 0]
             self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
 
@@ -261,7 +261,7 @@ class _Fit:
             np.subtract.at(self.residual.reshape(-1), numbers.ravel(), light.ravel())
 
     def solve_fluxes(self) -> np.ndarray:
-        """Return the fluxes (m,) that fit best at the places as they are."""
+        """Return the fluxes (m,) that fit best at the positions as they are."""
         return self.solve(self._derivatives[:, :1] * self.weight[:, None], np.zeros(1))[0][:, 0]
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
@@ -269,7 +269,7 @@ class _Fit:
         # The old light is added to the residuals, and the light at the new position is subtracted.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
-        self.place[rows] += change[:, 1:]
+        self.position[rows] += change[:, 1:]
         self._draw(rows)
         self._subtract(rows, self.flux[rows])
 
@@ -286,8 +286,8 @@ class _Fit:
         return np.asarray(np.square(residual).sum(axis=(1, 2)))
 
     def cost(self) -> np.ndarray:
-        """Return χ² (m,) of the boxes and of the distances from the expected places."""
-        distance_square = np.square(self.place - self.prior_place).sum(axis=1)
+        """Return χ² (m,) of the boxes and of the distances from the expected positions."""
+        distance_square = np.square(self.position - self.prior_position).sum(axis=1)
         return np.asarray(self.squares() + self.pull * distance_square)
 
     def solve(
@@ -304,9 +304,9 @@ class _Fit:
         # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
         residual = self.weight * self.residual.ravel()[self.boxes]
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
-        # Places, if they are fitted, are drawn to where they are expected.
+        # Positions, if they are fitted, are drawn to where they are expected.
         if design.shape[1] == self.parameters:
-            gradient[:, 1:] -= self.pull * (self.place - self.prior_place)
+            gradient[:, 1:] -= self.pull * (self.position - self.prior_position)
         if not len(unit):
             return gradient, gradient
         # It is positive definite: no pivots, and an order for symmetric matrices.
@@ -332,7 +332,7 @@ class _Fit:
         # Flags as photutils has them: 1 not all pixels, 2 off the image, 4 no flux above 0, 8 not
         # at rest, 32 at the bound of its range.
         height, width = self.image.shape
-        outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
+        outside = (self.position < -0.5) | (self.position > (width - 0.5, height - 0.5))
         flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
         flags += 8 * moving + 32 * bound.any(axis=1)
 
@@ -347,7 +347,7 @@ class _Fit:
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
         np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
         return JointFit(
-            fill_rows(self.place),
+            fill_rows(self.position),
             fill_rows(error[:, 1:]),
             fill_rows(self.flux),
             fill_rows(error[:, 0]),

@@ -108,8 +108,9 @@ def measure_snr(
     Returns
     -------
     snr, flux : ndarray, shape (n, 2(h + 1 − s), 2(w + 1 − s))
-        At the pixels about which a part has the whole PSF. S is 0 where more than half of Σ P² is
-        in bad pixels.
+        At the pixels about which a part has the whole PSF. S and F are 0 where more than half of
+        Σ P² is in bad pixels, and where Σ P²/σ² is below 1e-6 of its largest value: the sums are in
+        single precision.
     """
     from scipy import fft
 
@@ -130,9 +131,11 @@ def measure_snr(
 
     projection = correlate(weight * deviation, kernels[0])
     information = correlate(weight**2, kernels[1])
-    is_known = np.ones(information.shape, dtype=bool)
+    # The error of a sum is 1e-7 of the largest one: in the light of a star of 10⁵ σ, whose model's
+    # error makes σ 10³ times as large, nothing can be found.
+    is_known = information > 1e-6 * information.max(axis=(1, 2, 3), keepdims=True)
     if not is_used.all():
-        is_known = correlate(is_used, kernels[1]) > 0.5 * square.sum(axis=(2, 3), keepdims=True)
+        is_known &= correlate(is_used, kernels[1]) > 0.5 * square.sum(axis=(2, 3), keepdims=True)
     root = np.sqrt(np.where(is_known, information, np.inf))
     snr = projection / root
     flux = snr / root

@@ -35,7 +35,7 @@ def add_measured_gain(model: FieldPsfs, observation: Image) -> Image:
     Raises
     ------
     PredictionError
-        If the model knows no PSF of a place.
+        If the model knows no PSF of a position.
     ObservationError
         If the sky cannot be measured.
     """
@@ -52,7 +52,7 @@ def add_measured_gain(model: FieldPsfs, observation: Image) -> Image:
 
 
 def measure_gain(
-    model: FieldPsfs, flat: np.ndarray, noise: np.ndarray, bad: np.ndarray, place: np.ndarray
+    model: FieldPsfs, flat: np.ndarray, noise: np.ndarray, bad: np.ndarray, position: np.ndarray
 ) -> tuple[float, float] | None:
     """Measure the gain of an image, and its standard error.
 
@@ -64,7 +64,7 @@ def measure_gain(
         Sky-subtracted counts, and σ of the sky.
     bad : ndarray of bool, shape (h, w)
         Pixels that are not used.
-    place : ndarray, shape (n, 2)
+    position : ndarray, shape (n, 2)
         x and y of stars, NaN where unknown.
 
     Returns
@@ -76,22 +76,22 @@ def measure_gain(
     Raises
     ------
     PredictionError
-        If the model knows no PSF of a place.
+        If the model knows no PSF of a position.
     """
     # Stars alone in a box of about 1.6 FWHM, and without a neighbour within 3 FWHM.
     fwhm = model.fwhm_px()
     half = min(int(np.ceil(0.8 * fwhm)), model.stamp_px // 2 - 1)
     axis = np.arange(-half, half + 1)
-    place = place[stars_alone(place, bad, half, 3.0 * fwhm)]
+    position = position[stars_alone(position, bad, half, 3.0 * fwhm)]
     # The brightest 300 of these: fainter ones show no photon noise.
-    column, row = np.floor(place + 0.5).astype(int).T
+    column, row = np.floor(position + 0.5).astype(int).T
     brightest = np.argsort(-flat[row, column], kind="stable")[:300]
-    place, column, row = place[brightest], column[brightest], row[brightest]
-    if len(place) < 10:
+    position, column, row = position[brightest], column[brightest], row[brightest]
+    if len(position) < 10:
         return None
     pixels = row[:, None, None] + axis[:, None], column[:, None, None] + axis
     # Pixels (n, P) in units of a typical σ of the sky.
-    data, sigma = (image[pixels].reshape(len(place), -1) for image in (flat, noise))
+    data, sigma = (image[pixels].reshape(len(position), -1) for image in (flat, noise))
     unit = float(np.median(sigma))
     data, sigma = data / unit, sigma / unit
     psfs, photons, off = PsfGrid.sample(model), 0.0, 0.0
@@ -100,7 +100,7 @@ def measure_gain(
         # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
         # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
         corner = np.stack([column, row], axis=1) - half
-        light_and_slopes = psfs.stamps(place, corner, len(axis)).reshape(len(place), 3, -1)
+        light_and_slopes = psfs.stamps(position, corner, len(axis)).reshape(len(position), 3, -1)
         design = np.pad(light_and_slopes, ((0, 0), (0, 1), (0, 0)), constant_values=1.0)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
@@ -121,14 +121,16 @@ def measure_gain(
         # Centres stay in their pixel, about which the box lies.
         move = np.clip(parameters[:, 1:3] / np.maximum(parameters[:, :1], 1e-12), -0.2, 0.2)
         middle = np.stack([column, row], axis=1)
-        place = np.clip(place + move, middle - 0.49, middle + 0.49)
+        position = np.clip(position + move, middle - 0.49, middle + 0.49)
     # g = 1 / (photons · unit), and σ_g = g σ_photons / photons.
     if not photons > 5.0 * error:
         return None
     return 1.0 / (photons * unit), error / (photons**2 * unit)
 
 
-def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: float) -> np.ndarray:
+def stars_alone(
+    position: np.ndarray, bad: np.ndarray, half_px: int, distance_px: float
+) -> np.ndarray:
     """Return which stars at positions (n, 2) have neither bad pixels in their box nor neighbours.
 
     The box has 2 `half_px` + 1 pixels along each side and is whole in the image, of which `bad`
@@ -137,18 +139,19 @@ def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: f
     from scipy.ndimage import maximum_filter
     from scipy.spatial import cKDTree
 
-    rows_with_place = np.flatnonzero(np.isfinite(place).all(axis=1))
-    is_alone = np.zeros(len(place), dtype=bool)
-    if len(rows_with_place) < 2:
+    rows_with_position = np.flatnonzero(np.isfinite(position).all(axis=1))
+    is_alone = np.zeros(len(position), dtype=bool)
+    if len(rows_with_position) < 2:
         return is_alone
     # The nearest star of the list but the star itself.
-    distance = cKDTree(place[rows_with_place]).query(place[rows_with_place], k=2)[0][:, 1]
+    points = position[rows_with_position]
+    distance = cKDTree(points).query(points, k=2)[0][:, 1]
     # Beyond its edges, an image has only bad pixels.
     has_bad_pixel = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
-    column, row = np.floor(place[rows_with_place] + 0.5).astype(int).T
+    column, row = np.floor(points + 0.5).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < bad.shape[1]) & (row < bad.shape[0])
     has_bad_pixel = has_bad_pixel[np.where(inside, row, 0), np.where(inside, column, 0)]
-    is_alone[rows_with_place] = inside & ~has_bad_pixel & (distance > distance_px)
+    is_alone[rows_with_position] = inside & ~has_bad_pixel & (distance > distance_px)
     return is_alone
 
 

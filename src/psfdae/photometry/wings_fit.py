@@ -16,7 +16,7 @@ import numpy as np
 from psfdae.base.progress import steps
 from psfdae.image.sky import Sky, subtract_sky
 from psfdae.image.sky_level import add_shared_noise, measure_sky
-from psfdae.psf.wings import Wings, compute_prior_profile, tents
+from psfdae.psf.wings import Wings, compute_hats, compute_prior_profile
 from psfdae.stars.moments import label_medians
 
 
@@ -25,7 +25,7 @@ class StarFluxes(NamedTuple):
 
     Attributes
     ----------
-    place : ndarray, shape (n, 2)
+    position : ndarray, shape (n, 2)
         x and y in px; NaN where unknown.
     flux : ndarray, shape (n,)
         In the unit of the image, summed over pixels. Stars whose flux is NaN or not above 0 are
@@ -35,7 +35,7 @@ class StarFluxes(NamedTuple):
         which it is NaN are left out.
     """
 
-    place: np.ndarray
+    position: np.ndarray
     flux: np.ndarray
     outer_share: np.ndarray
 
@@ -48,15 +48,15 @@ BINS_PER_PX = 64
 """Distances of pixels from stars are rounded to this part of a pixel: wings are smooth."""
 
 
-def tabulate_tents(wings: Wings) -> np.ndarray:
+def tabulate_hats(wings: Wings) -> np.ndarray:
     """Return h_0 … h_{K−1} in bins of the distance from a star, shape (bins, K).
 
-    The first bin is the stamp, where h_0 is 1 and the tents are 0.
+    The first bin is the stamp, where h_0 is 1 and the hat functions are 0.
     """
     # The corner of a window is √2 times as far as its edge.
     last = int(np.ceil(1.5 * (wings.radius_px[-1] + 1.0) * BINS_PER_PX))
     distance = np.arange(last + 1, dtype=np.float32) / BINS_PER_PX
-    heights = np.pad(tents(distance, wings.radius_px), ((1, 0), (1, 0)))
+    heights = np.pad(compute_hats(distance, wings.radius_px), ((1, 0), (1, 0)))
     heights[0, 0] = 1.0
     return np.ascontiguousarray(heights.T)
 
@@ -69,16 +69,16 @@ def select_lit_stars(
     In a crowded image, these have most of the light of all wings. The brightest ones that have
     a `share` of Σ (F s)² are enough.
     """
-    # F s, the factor of all tents of a star.
+    # F s, the factor of all hat functions of a star.
     scaled_flux = stars.flux * wings.scale(stars.outer_share)
     # Unlike in `scale`, stars of unknown outer share are left out.
     scaled_flux = np.where(np.isfinite(stars.outer_share), scaled_flux, np.nan)
-    is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.place).all(axis=1)
+    is_lit = np.isfinite(scaled_flux) & (scaled_flux > 0) & np.isfinite(stars.position).all(axis=1)
     lit_stars = np.flatnonzero(is_lit)
     brightest = lit_stars[np.argsort(-scaled_flux[lit_stars], kind="stable")[:1000]]
     information = np.cumsum(np.square(scaled_flux[brightest]))
     brightest = brightest[: 1 + np.searchsorted(information, share * information[-1:])[:1].sum()]
-    return stars.place[brightest], scaled_flux[brightest]
+    return stars.position[brightest], scaled_flux[brightest]
 
 
 def star_bins(
@@ -87,7 +87,7 @@ def star_bins(
     """Yield the number of each star near an area, its window, and bins of the pixels there.
 
     A window has the pixels of the area that the wings of the star reach, rows and columns from the
-    first ones of the area; the bins (rows, columns) are indices of `tabulate_tents`. `positions`
+    first ones of the area; the bins (rows, columns) are indices of `tabulate_hats`. `positions`
     (n, 2) are x and y.
     """
     rows, columns = area
@@ -113,7 +113,7 @@ def star_bins(
         yield star, window, bins
 
 
-def draw_tents(
+def draw_hats(
     shape: tuple[int, ...], stars: StarFluxes, wings: Wings, tile_px: int
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
     """Yield tiles of an image (h, w), and Σ F s h_k of the stars in them, shape (K, rows, columns).
@@ -121,23 +121,23 @@ def draw_tents(
     The shape of tiles that no wings reach is (0, rows, columns). Faint stars, which have 0.2 % of
     Σ (F s)², tell next to nothing of the wings, and are left out.
     """
-    heights, (positions, scaled_flux) = tabulate_tents(wings), select_lit_stars(stars, wings, 0.998)
-    # The tents of a whole image would take K times its memory.
+    heights, (positions, scaled_flux) = tabulate_hats(wings), select_lit_stars(stars, wings, 0.998)
+    # The hat functions of a whole image would take K times its memory.
     height, width = shape
     for top in steps("wings", range(0, height, tile_px)):
         for left in range(0, width, tile_px):
             tile = slice(top, min(top + tile_px, height)), slice(left, min(left + tile_px, width))
             sides = tile[0].stop - top, tile[1].stop - left
-            tile_tents = None
+            tile_hats = None
             for star, window, bins in star_bins(tile, positions, wings):
-                if tile_tents is None:
-                    tile_tents = np.zeros((*sides, len(wings.profile)), np.float32)
-                star_tents = np.take(heights, bins, axis=0, mode="clip")
-                star_tents *= scaled_flux[star]
-                tile_tents[window] += star_tents
+                if tile_hats is None:
+                    tile_hats = np.zeros((*sides, len(wings.profile)), np.float32)
+                star_hats = np.take(heights, bins, axis=0, mode="clip")
+                star_hats *= scaled_flux[star]
+                tile_hats[window] += star_hats
             yield (
                 tile,
-                np.moveaxis(np.empty((*sides, 0)) if tile_tents is None else tile_tents, 2, 0),
+                np.moveaxis(np.empty((*sides, 0)) if tile_hats is None else tile_hats, 2, 0),
             )
 
 
@@ -146,7 +146,7 @@ def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -
     # One map, to which each star adds the light in its window.
     image, (height, width) = np.zeros(shape, np.float32), shape
     if wings is not None:
-        light = (tabulate_tents(wings) @ wings.profile).astype(np.float32)
+        light = (tabulate_hats(wings) @ wings.profile).astype(np.float32)
         positions, scaled_flux = select_lit_stars(stars, wings)
         for star, window, bins in star_bins(np.s_[0:height, 0:width], positions, wings):
             image[window] += float(scaled_flux[star]) * np.take(light, bins, mode="clip")
@@ -177,7 +177,7 @@ def fit_wings(
     stamp_px : int
         Side of the models' stamps.
     earlier : Wings, optional
-        Wings of the previous fit, which are subtracted from `residual`; their tents are used again.
+        Wings of the previous fit, which are subtracted from `residual`; their radii are used again.
 
     Returns
     -------
@@ -192,17 +192,17 @@ def fit_wings(
     mean_share = float(np.average(outer_share[has_light], weights=flux[has_light]))
     if not mean_share > 0:
         return None
-    # Six tents, of which the last one ends 2.5 stamps from the star. An earlier fit's tents stay;
-    # its profile, which belongs to its own mean share, is rescaled to this one.
+    # Six hat functions, of which the last ends 2.5 stamps from the star, or as in an earlier fit,
+    # whose profile belongs to its own mean share and is rescaled to this one.
     radius, profile = np.geomspace(stamp_px / 2, 2.5 * stamp_px, 7), np.zeros(7)
     if earlier is not None:
         radius = earlier.radius_px
         profile = earlier.profile * (mean_share / earlier.outer_share)
     count = len(radius)
-    tents_of_fit = Wings(radius, profile, np.zeros((count, count)), mean_share)
+    hats_of_fit = Wings(radius, profile, np.zeros((count, count)), mean_share)
     limit = np.inf if earlier is None else 4.0
     normal, projection, square, pixels, blocks = sum_products(
-        residual, sigma, bad, stars, tents_of_fit, stamp_px, limit
+        residual, sigma, bad, stars, hats_of_fit, stamp_px, limit
     )
     if not normal[-1, -1] > 0:
         return None
@@ -271,8 +271,8 @@ def sum_products(
 ) -> Products:
     """Return the sums over the pixels of an image (h, w) that fit the profile of wings.
 
-    Parameters are as in `fit_wings`; pixels over `limit` σ are left out, and `wings` give the tents
-    h_k and s.
+    Parameters are as in `fit_wings`; pixels over `limit` σ are left out, and `wings` give the hat
+    functions h_k and s.
     """
     from scipy.ndimage import uniform_filter
 
@@ -280,7 +280,7 @@ def sum_products(
     normal, projection = np.zeros((count + 1,) * 2), np.zeros(count + 1)
     square, pixels, blocks = 0.0, 0, []
     tile_px = stamp_px * max(1, 128 // stamp_px)
-    for tile, tile_tents in draw_tents(residual.shape, stars, wings, tile_px):
+    for tile, tile_hats in draw_hats(residual.shape, stars, wings, tile_px):
         # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves
         # there, and p_0 times the area of the stamp the light that it lacks, as an aperture would
         # find it. So σ² is averaged over a stamp, also across the edge of the tile.
@@ -295,13 +295,13 @@ def sum_products(
         smooth_variance = np.maximum(smooth_variance, variance.min())
         # Undetected stars and galaxies are left out.
         is_used = ~bad[tile] & (np.abs(residual[tile]) < limit * sigma[tile])
-        # Rows of the design of a tile: tents, if wings reach it, the even light, the data, and the
-        # number of the pixels. Their sums are small enough for single precision.
-        design = np.empty((len(tile_tents) + 3, *is_used.shape), np.float32)
-        design[:-3], design[-3], design[-2] = tile_tents, 1.0, residual[tile]
+        # Rows of the design of a tile: hat functions, if wings reach it, the even light, the data,
+        # and the number of the pixels. Their sums are small enough for single precision.
+        design = np.empty((len(tile_hats) + 3, *is_used.shape), np.float32)
+        design[:-3], design[-3], design[-2] = tile_hats, 1.0, residual[tile]
         design[:-1] *= np.where(is_used, 1.0 / np.sqrt(smooth_variance), 0.0)
         design[-1] = is_used
-        flat, first = design[:-1].reshape(len(design) - 1, -1), count - len(tile_tents)
+        flat, first = design[:-1].reshape(len(design) - 1, -1), count - len(tile_hats)
         products = flat @ flat.T
         normal[first:, first:] += products[:-1, :-1]
         projection[first:] += products[:-1, -1]
@@ -392,7 +392,7 @@ def around_stars(
         residual -= known_sky.level
         if fitted_stars is None:
             # The wings of stars unlike the PSF are subtracted, but not fitted.
-            is_like = is_like_psf(residual, bad, sigma, stars.place)
+            is_like = is_like_psf(residual, bad, sigma, stars.position)
             fitted_stars = stars._replace(flux=np.where(is_like, stars.flux, np.nan))
         previous, wings = wings, fit_wings(residual, sigma, bad, fitted_stars, stamp_px, wings)
         if wings is None:
@@ -496,7 +496,7 @@ def subtract_halos(
             wing_light[:] -= light
 
     halo_error = np.zeros_like(residual)
-    distance = np.hypot(*(stars.place[:, None] - cores[:, :2]).T)
+    distance = np.hypot(*(stars.position[:, None] - cores[:, :2]).T)
     is_on_core = distance < cores[:, 2:] + 1.0
     is_added = is_on_core.any(axis=0)
     move_wings(is_added, 1.0)

@@ -5,10 +5,10 @@ the stamp. The other light has one profile for all stars: a star of flux F has
 
     F s (p_0 h_0 + Σ_k p_k h_k(r))
 
-more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere; outside the stamp, triangular functions
-(tents) h_k of ln r times a power of r, where r is the distance from its centre in pixels; and s the
-light of the model's PSF in the outer part of its stamp divided by the mean of all stars: a wider
-PSF has brighter wings.
+more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere; outside the stamp, hat functions h_k of
+ln r times a power of r, where r is the distance from its centre in pixels; and s the light of the
+model's PSF in the outer part of its stamp divided by the mean of all stars: a wider PSF has
+brighter wings.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Wings:
     Attributes
     ----------
     radius_px : ndarray, shape (K,)
-        r_1 … r_K, equidistant in ln r: tops r_1 … r_{K−1} of the K − 1 tents, and r_K, where the
-        light ends. r_1 is half the side of the stamp.
+        r_1 … r_K, equidistant in ln r: tops r_1 … r_{K−1} of the K − 1 hat functions, and r_K,
+        where the light ends. r_1 is half the side of the stamp.
     profile : ndarray, shape (K,)
         p_0 … p_{K−1}, fractions of the flux in a pixel: p_0 in the stamp, p_k (r_k/r_1)^-3 at r_k.
     covariance : ndarray, shape (K, K)
@@ -41,7 +41,7 @@ class Wings:
     outer_part_start : float
         Radius at which the outer part of a stamp begins, as a fraction of half its side.
     steepness : float
-        Power of 1/r in the tents, as for light scattered by mirrors and air.
+        Power of 1/r in the hat functions, as for light scattered by mirrors and air.
     """
 
     outer_part_start: ClassVar[float] = 0.7
@@ -74,8 +74,8 @@ class Wings:
         shapes = [a.shape for a in (wings.profile, radius, wings.covariance)]
         if count < 2 or shapes != [(count,), (count,), (count, count)]:
             raise ValueError("wings with arrays of different lengths")
-        # No wings reach beyond 100 000 px, or have ten times the light of the star. The tents need
-        # radii that are equidistant in ln r.
+        # No wings reach beyond 100 000 px, or have ten times the light of the star. Hat functions
+        # need radii that are equidistant in ln r.
         is_rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < 1e5
         if not (is_rising and np.ptp(np.diff(np.log(radius))) < 1e-6):
             raise ValueError("wings with radii that are not a rising geometric sequence in pixels")
@@ -126,7 +126,7 @@ class Wings:
         # Fraction of a circle of radius r outside the stamp, a square of the half side h:
         # 4/π arccos(h/r), at most 1.
         outside = np.clip(np.arccos(np.minimum(half / np.maximum(r, half), 1.0)) * 4 / np.pi, 0, 1)
-        height = np.concatenate([1.0 - outside[None], outside * tents(r, self.radius_px)])
+        height = np.concatenate([1.0 - outside[None], outside * compute_hats(r, self.radius_px)])
         area = np.trapezoid(2 * np.pi * r * height, r, axis=1)
         return float(self.profile @ area), float(np.sqrt(area @ self.covariance @ area))
 
@@ -218,7 +218,7 @@ def sum_outer_part(psf: np.ndarray) -> np.ndarray:
     return np.asarray(psf[..., ring].sum(axis=-1))
 
 
-def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
+def compute_hats(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     """Return h_1 … h_{K−1}, (K − 1, …), at distances r (…) in pixels, for pixels outside the stamp.
 
     h_k = max(1 − |ln(r/r_1)/ln(r_2/r_1) − (k − 1)|, 0) (r/r_1)^-3: tops are equidistant in ln r.

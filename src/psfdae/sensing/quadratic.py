@@ -1,7 +1,8 @@
 """Approximate posteriors near modes, from images that are quadratic in the parameters.
 
-The image of a star at a place x near its mode is p(x) = Σ c_j φ_j(x), with φ = 1, x_i, x_i x_k. The
-vectors c_j are fitted to images at a design of places. Deviations of the counts from
+At an offset x from its mode, in units of the covariance, the parameters of a star are mean + S x,
+where S Sᵀ is the covariance, and its image is p(x) = Σ c_j φ_j(x), with φ = 1, x_i, x_i x_k. The
+vectors c_j are fitted to images at a design of offsets. Deviations of the counts from
 μ = F f p + B + √B s, the flux f and sky s being free, are weighted by the variance of the counts at
 the mode. χ² is then the square of a vector that is linear in f φ, s and 1, which a QR decomposition
 shortens from a row for each pixel to one for each term: an evaluation takes a few microseconds.
@@ -18,15 +19,15 @@ MAX_PARAMETERS = 21
 """Largest number of parameters: more have too many products for a fit to pay."""
 
 
-def quadratic_terms(place: np.ndarray) -> np.ndarray:
-    """Return 1, x_i, and all products x_i x_k of the components of places (m, D), (m, Q)."""
-    rows, columns = np.triu_indices(place.shape[1])
-    products = place.T[rows] * place.T[columns]
-    return np.concatenate([np.ones((1, len(place))), place.T, products]).T
+def quadratic_terms(offset: np.ndarray) -> np.ndarray:
+    """Return 1, x_i, and all products x_i x_k of the components of offsets (m, D), (m, Q)."""
+    rows, columns = np.triu_indices(offset.shape[1])
+    products = offset.T[rows] * offset.T[columns]
+    return np.concatenate([np.ones((1, len(offset))), offset.T, products]).T
 
 
 def draw_design(size: int, rng: np.random.Generator) -> np.ndarray:
-    """Return places (n, D) from a standard normal, each with its opposite.
+    """Return offsets (n, D) from a standard normal, each with its opposite.
 
     Terms of odd order then do not disturb the fit of even ones, of which there are two for three
     pairs.
@@ -42,7 +43,7 @@ class QuadraticPosterior:
     Attributes
     ----------
     mean, factor : ndarray, shapes (M, D + 2) and (M, D + 2, D + 2)
-        Parameters are mean + factor · x at the place x. The factor is lower triangular; flux and
+        Parameters are mean + factor · x at the offset x. The factor is lower triangular; flux and
         sky, the last two parameters, do not change the image.
     prior_precision : ndarray, shape (D + 2,)
         Inverse variance of the prior of the parameters.
@@ -55,13 +56,13 @@ class QuadraticPosterior:
     prior_precision: np.ndarray
     root: Mapping[int, np.ndarray]
 
-    def __call__(self, mode: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Return logarithms (m,) of the posteriors at places (m, D + 2) about ascending modes."""
-        terms, height = quadratic_terms(place[:, :-2]), np.empty(len(place))
+    def __call__(self, mode: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return logarithms (m,) of the posteriors at offsets (m, D + 2) from ascending modes."""
+        terms, height = quadratic_terms(offset[:, :-2]), np.empty(len(offset))
         numbers, starts = np.unique(mode, return_index=True)
         for number, first, end in zip(numbers, starts, [*starts[1:], len(mode)], strict=True):
             part = slice(first, end)
-            parameters = self.mean[number] + place[part] @ self.factor[number].T
+            parameters = self.mean[number] + offset[part] @ self.factor[number].T
             flux, sky = parameters[:, -2:-1], parameters[:, -1:]
             vector = np.concatenate([flux * terms[part], sky, np.full_like(sky, -1.0)], axis=1)
             residual = vector.astype(np.float32) @ self.root[number].T
@@ -71,7 +72,7 @@ class QuadraticPosterior:
 
 
 def fit_root(
-    place: np.ndarray,
+    offset: np.ndarray,
     images: np.ndarray,
     counts: np.ndarray,
     flux: float,
@@ -82,8 +83,8 @@ def fit_root(
 
     Parameters
     ----------
-    place : ndarray, shape (n, D)
-        Places of the design.
+    offset : ndarray, shape (n, D)
+        Offsets of the design.
     images : ndarray, shape (n, P)
         Images of light 1 there, pixel by pixel.
     counts : ndarray, shape (P,)
@@ -95,7 +96,7 @@ def fit_root(
     """
     used = np.isfinite(counts)
     # Coefficients c_j of each pixel; the first one is the image in the mode.
-    coefficients = flux * (np.linalg.pinv(quadratic_terms(place)) @ images[:, used])
+    coefficients = flux * (np.linalg.pinv(quadratic_terms(offset)) @ images[:, used])
     variance = np.maximum(mode_flux * coefficients[0] + sky_counts, 0.01 * sky_counts)
     # Rows: coefficients, a unit of sky, and the counts of the star.
     sky = np.full_like(variance, np.sqrt(sky_counts))

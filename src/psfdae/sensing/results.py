@@ -327,8 +327,8 @@ class Wavefronts:
         k = len(self.terms.names)
         model = np.full(self.stamps.data.shape, np.nan)
         for row, star in enumerate(self.star):
-            place, flux = self.draws[row, :, k : k + 2], self.draws[row, :, k + 2]
-            images = self.search.optics.operator.stamps(self._pupil_modes(row, place))
+            position, flux = self.draws[row, :, k : k + 2], self.draws[row, :, k + 2]
+            images = self.search.optics.operator.stamps(self._pupil_modes(row, position))
             # Fluxes of the draws, from units of the search to electrons to the stamps' unit.
             light = self.search.flux[star] * flux / self.search.photons.gain[star]
             model[star] = (light[:, None, None] * images).mean(axis=0)
@@ -341,10 +341,10 @@ class Wavefronts:
         is_unused = self.stamps.bad | self.stamps.saturated
         return np.where(is_unused, np.nan, self.stamps.data - sky - self.model)
 
-    def _pupil_modes(self, row: int, place_px: np.ndarray) -> np.ndarray:
+    def _pupil_modes(self, row: int, position_px: np.ndarray) -> np.ndarray:
         """Return mode coefficients (s, J + 2) of the draws of `star[row]` at positions (s, 2)."""
-        stars = np.full(len(place_px), self.star[row])
-        return self.search.optics.mode_coefficients(stars, self.coefficients[row], place_px)
+        stars = np.full(len(position_px), self.star[row])
+        return self.search.optics.mode_coefficients(stars, self.coefficients[row], position_px)
 
     @property
     def snr(self) -> np.ndarray:

@@ -40,12 +40,12 @@ LogPosterior = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function of indices of posteriors (m,) and parameters (m, D): logarithm of the posterior (m,)."""
 
 Approximation = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Function of ascending indices of modes (m,) and places (m, D) relative to each mode, in units of
-its covariance: approximate logarithm of the posterior (m,)."""
+"""Function of ascending indices of modes (m,) and offsets x (m, D), where parameters are mean + F x
+with the covariance F Fᵀ of each mode: approximate logarithm of the posterior (m,)."""
 
 Approximate = Callable[[np.ndarray, Mapping[int, np.ndarray]], Approximation]
-"""Function of indices of modes, and of places by mode where it shall be right, perhaps none, that
-returns an approximation near these modes."""
+"""Function of indices of modes, and of offsets by mode at which it must be accurate, perhaps none,
+that returns an approximation near these modes."""
 
 Twin = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Function of indices of posteriors (m,) and parameters (m, D): parameters (m, D) with the same
@@ -64,7 +64,7 @@ def sample_around(
 ) -> np.ndarray:
     """Draw from posteriors around their modes, by parallel Markov chains.
 
-    A proposal mixes the position of a chain with a draw from the reference normal of its mode (Neal
+    A proposal mixes the point of a chain with a draw from the reference normal of its mode (Neal
     1999, Bayesian Statistics 6, 475). It is accepted by the ratio of posterior to normal: where
     the posterior is nearly normal, every step is an independent draw. If there is an approximation,
     chains follow it, and the posterior itself is evaluated for the returned draws alone: they are
@@ -106,58 +106,60 @@ def sample_around(
     posterior = np.repeat(np.arange(posteriors), chains)
 
     def follow(
-        part: np.ndarray, fit_places: Mapping[int, np.ndarray] | None
+        part: np.ndarray, fit_offsets: Mapping[int, np.ndarray] | None
     ) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
-        """Return draws of some posteriors, their effective fraction, and their places by mode.
+        """Return draws of some posteriors, their effective fraction, and offsets by mode.
 
-        Chains follow an approximation, or without `fit_places` the posterior.
+        Chains follow an approximation, or without `fit_offsets` the posterior.
         """
         chain = np.flatnonzero(np.isin(posterior, part))
         chain_mode, chain_rngs = mode[chain], [rngs[index] for index in part]
         # Draws of a reference normal are mean + S x with x ~ N(0, 1) and S Sᵀ = scale² covariance.
         scale = CHAINS.reference_scale * factor[chain_mode]
 
-        def to_parameters(place: np.ndarray) -> np.ndarray:
-            return np.asarray(mean[chain_mode] + (scale @ place[..., None])[..., 0])
+        def to_parameters(offset: np.ndarray) -> np.ndarray:
+            return np.asarray(mean[chain_mode] + (scale @ offset[..., None])[..., 0])
 
-        def evaluate(place: np.ndarray) -> np.ndarray:
-            return log_posterior(posterior[chain], to_parameters(place))
+        def evaluate(offset: np.ndarray) -> np.ndarray:
+            return log_posterior(posterior[chain], to_parameters(offset))
 
-        if approximate is None or fit_places is None:
-            places, _ = run_chains(evaluate, size, chain_rngs)
-            return group_by_posterior(to_parameters(places), part.size), np.ones(part.size), {}
-        approximation = approximate(np.unique(chain_mode), fit_places)
-        places, height = run_chains(
-            lambda place: approximation(chain_mode, CHAINS.reference_scale * place),
+        if approximate is None or fit_offsets is None:
+            offsets, _ = run_chains(evaluate, size, chain_rngs)
+            return group_by_posterior(to_parameters(offsets), part.size), np.ones(part.size), {}
+        approximation = approximate(np.unique(chain_mode), fit_offsets)
+        offsets, height = run_chains(
+            lambda offset: approximation(chain_mode, CHAINS.reference_scale * offset),
             size,
             chain_rngs,
         )
         # Draws are drawn again with weights w = posterior / approximation. Their effective fraction
         # is (Σ w)² / n Σ w².
-        excess = np.array([evaluate(place) for place in places]) - height
+        excess = np.array([evaluate(offset) for offset in offsets]) - height
         log_weight = group_by_posterior(excess, part.size)
         weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-        rows = group_by_posterior(to_parameters(places), part.size)
+        rows = group_by_posterior(to_parameters(offsets), part.size)
         indices = [choose_evenly(*pair) for pair in zip(weight, chain_rngs, strict=True)]
-        mode_places = {}
+        mode_offsets = {}
         for number in np.unique(chain_mode):
-            mode_place = CHAINS.reference_scale * places[:, chain_mode == number].reshape(-1, size)
-            earlier_places = fit_places.get(number, mode_place[:0])
-            mode_places[number] = np.concatenate([earlier_places, mode_place])
+            part_offsets = offsets[:, chain_mode == number].reshape(-1, size)
+            earlier_offsets = fit_offsets.get(number, part_offsets[:0])
+            mode_offsets[number] = np.concatenate(
+                [earlier_offsets, CHAINS.reference_scale * part_offsets]
+            )
         effective = weight.mean(axis=1) ** 2 / (weight**2).mean(axis=1)
         return (
             np.take_along_axis(rows, np.array(indices)[..., None], axis=1),
             effective,
-            mode_places,
+            mode_offsets,
         )
 
     # Where the approximation is poor, chains follow one that is fitted to their draws, too, at most
     # twice; where even this is poor, the posterior.
-    draws, effective, places = follow(np.arange(posteriors), None if approximate is None else {})
+    draws, effective, offsets = follow(np.arange(posteriors), None if approximate is None else {})
     for is_last in (False, False, True):
         poor = np.flatnonzero(effective < CHAINS.min_effective)
         if poor.size:
-            draws[poor], effective[poor], places = follow(poor, None if is_last else places)
+            draws[poor], effective[poor], offsets = follow(poor, None if is_last else offsets)
     # The twin replaces a draw with the probability 1/(1 + e^−Δ), with its gain Δ in ln p.
     flat, flat_posterior = draws.reshape(-1, size), np.repeat(np.arange(posteriors), draws.shape[1])
     twin_draws, gain = twin(flat_posterior, flat)
@@ -176,8 +178,8 @@ def choose_evenly(
     """
     share, count = np.cumsum(weight) / weight.sum(), count or len(weight)
     # Rounding may leave the last share below 1.
-    places = (np.arange(count) + rng.random()) / count
-    return np.minimum(np.searchsorted(share, places), len(weight) - 1)
+    points = (np.arange(count) + rng.random()) / count
+    return np.minimum(np.searchsorted(share, points), len(weight) - 1)
 
 
 def group_by_posterior(values: np.ndarray, posteriors: int) -> np.ndarray:
@@ -189,12 +191,12 @@ def group_by_posterior(values: np.ndarray, posteriors: int) -> np.ndarray:
 def run_chains(
     evaluate: Callable[[np.ndarray], np.ndarray], size: int, rngs: Sequence[np.random.Generator]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return places of chains, and the logarithm of their posterior.
+    """Return states of chains, and the logarithm of their posterior.
 
     Parameters
     ----------
     evaluate : callable
-        Function of places of all chains of n posteriors, (n × `CHAINS.number`, D), in units of
+        Function of states of all chains of n posteriors, (n × `CHAINS.number`, D), in units of
         reference normals, that returns the logarithm of their posteriors.
     size : int
         Number D of parameters.
@@ -203,7 +205,7 @@ def run_chains(
 
     Returns
     -------
-    places, height : ndarray, shapes (`CHAINS.draws`, n × `CHAINS.number`, D) and without D
+    states, height : ndarray, shapes (`CHAINS.draws`, n × `CHAINS.number`, D) and without D
     """
     posteriors, chains = len(rngs), CHAINS.number
 
@@ -212,28 +214,28 @@ def run_chains(
         return np.concatenate([rng.standard_normal((chains, size)) for rng in rngs])
 
     # A chain begins at a draw from its mode, which is narrower than the reference normal.
-    place = draw_normals() / CHAINS.reference_scale
-    height = evaluate(place)
+    state = draw_normals() / CHAINS.reference_scale
+    height = evaluate(state)
     stride = np.ones(posteriors)
     # All chains of all posteriors advance together.
-    places, heights = [], []
+    states, heights = [], []
     for step in steps("draws", range(1, CHAINS.burn_in + CHAINS.draws * CHAINS.thinning + 1)):
         # Proposal x' = √(1 − s²) x + s ξ with the stride s. The reference normal is invariant under
         # it, so the ratio of posterior to normal decides: ln α = Δ ln p + ½ (|x'|² − |x|²).
         part = np.repeat(stride, chains)[:, None]
-        trial = np.sqrt(1.0 - part**2) * place + part * draw_normals()
+        trial = np.sqrt(1.0 - part**2) * state + part * draw_normals()
         trial_height = evaluate(trial)
-        gain = trial_height - height + 0.5 * ((trial**2).sum(axis=1) - (place**2).sum(axis=1))
+        gain = trial_height - height + 0.5 * ((trial**2).sum(axis=1) - (state**2).sum(axis=1))
         # Above 0, because of the logarithm.
         uniform = np.concatenate([1.0 - rng.random(chains) for rng in rngs])
         is_accepted = np.log(uniform) < gain
-        place = np.where(is_accepted[:, None], trial, place)
+        state = np.where(is_accepted[:, None], trial, state)
         height = np.where(is_accepted, trial_height, height)
         # During burn-in, ln s changes by 0.3 times the difference from the target acceptance.
         if step <= CHAINS.burn_in:
             share = is_accepted.reshape(posteriors, chains).mean(axis=1)
             stride = np.clip(stride * np.exp(0.3 * (share - CHAINS.acceptance)), 0.02, 1.0)
         elif (step - CHAINS.burn_in) % CHAINS.thinning == 0:
-            places.append(place)
+            states.append(state)
             heights.append(height)
-    return np.array(places), np.array(heights)
+    return np.array(states), np.array(heights)

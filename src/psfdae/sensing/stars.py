@@ -130,7 +130,7 @@ class StarOptics:
         return np.asarray(self.terms.mean[star] + self.terms.sd[star] * z)
 
     def mode_coefficients(
-        self, star: np.ndarray, coefficients: np.ndarray, place_px: np.ndarray
+        self, star: np.ndarray, coefficients: np.ndarray, position_px: np.ndarray
     ) -> np.ndarray:
         """Return the coefficients (m, J + 2) of the pupil's modes, tilts included.
 
@@ -140,12 +140,12 @@ class StarOptics:
             Index of the star of each row.
         coefficients : ndarray, shape (m, K)
             Coefficients of the terms in waves.
-        place_px : ndarray, shape (m, 2)
+        position_px : ndarray, shape (m, 2)
             Position (x, y) of the star from the middle of the stamp.
         """
         # Terms are linear in the modes; the matrix depends on the field angle of the star.
         waves = np.einsum("mk,mkj->mj", coefficients, self.terms.to_modes[star])
-        return np.concatenate([waves, place_px], axis=1)
+        return np.concatenate([waves, position_px], axis=1)
 
     def derivatives(self, modes: np.ndarray, directions: np.ndarray) -> StampsAndSlopes:
         """Return stamps of light 1, (m, P), and their derivatives, (m, k + 2, P).
@@ -403,9 +403,9 @@ class WavefrontSearch:
         # There are 2 · search_px + 1 shifts along each axis. A window that begins at a higher index
         # of the wide stamp shows the star at a lower index.
         row, column = np.divmod(shift[best_rows], 2 * optics.search_px + 1)
-        place = optics.search_px - np.stack([column, row], axis=1)
+        position = optics.search_px - np.stack([column, row], axis=1)
         relative_flux = np.maximum(flux[best_rows, shift[best_rows]] / self.flux[star], 0.01)
-        return np.column_stack([z[best_rows], place, relative_flux, np.zeros(best_rows.size)])
+        return np.column_stack([z[best_rows], position, relative_flux, np.zeros(best_rows.size)])
 
     def _match(self, star: int, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Fit the flux of candidates z (c, K) at S shifts; return it and its gain, (c, S).
@@ -417,15 +417,15 @@ class WavefrontSearch:
         light = self.photons.counts[star] - self.photons.sky_counts[star]
         is_used = np.isfinite(light)
         light = np.where(is_used, light - light[is_used].mean(), 0.0)
-        # The star, and its used pixels, at each of the S places in a wide image, (2, S, wide²).
-        shifts, wide = 2 * optics.search_px + 1, side + 2 * optics.search_px
-        placed = np.zeros((2, shifts, shifts, wide, wide))
+        # The star, and its used pixels, at each of the S shifts in a wider image, (2, S, P).
+        shifts, wide_px = 2 * optics.search_px + 1, side + 2 * optics.search_px
+        shift_images = np.zeros((2, shifts, shifts, wide_px, wide_px))
         windows = np.lib.stride_tricks.sliding_window_view(
-            placed, (side, side), axis=(3, 4), writeable=True
+            shift_images, (side, side), axis=(3, 4), writeable=True
         )
         windows = np.einsum("nijijab->nijab", windows)
         windows[0], windows[1] = light.reshape(side, side), is_used.reshape(side, side)
-        star_at, used_at = placed.reshape(2, shifts**2, wide**2).swapaxes(1, 2)
+        star_at, used_at = shift_images.reshape(2, shifts**2, wide_px**2).swapaxes(1, 2)
         stars = np.full(len(z), star)
         coefficients = optics.coefficients(stars, z)
         modes = optics.mode_coefficients(stars, coefficients, np.zeros((len(z), 2)))
@@ -444,9 +444,9 @@ class WavefrontSearch:
         limit = np.array([MAX_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
 
         def evaluate(members: np.ndarray, parameters: np.ndarray) -> Evaluation:
-            stars, z, place = star[members], parameters[:, :k], parameters[:, k : k + 2]
+            stars, z, position = star[members], parameters[:, :k], parameters[:, k : k + 2]
             # Poisson likelihood of the counts.
-            modes = optics.mode_coefficients(stars, optics.coefficients(stars, z), place)
+            modes = optics.mode_coefficients(stars, optics.coefficients(stars, z), position)
             directions = optics.terms.sd[stars][:, :, None] * optics.terms.to_modes[stars]
             stamps, slopes = optics.derivatives(modes, directions)
             mean, slopes = self.predict_counts(stars, stamps, slopes, parameters[:, k:])
@@ -474,9 +474,9 @@ class WavefrontSearch:
 
         def compute_stamps(star: np.ndarray, parameters: np.ndarray) -> np.ndarray:
             # Outside of the limits, the image at the limit is used.
-            place = np.clip(parameters[:, k : k + 2], -optics.reach_px, optics.reach_px)
+            position = np.clip(parameters[:, k : k + 2], -optics.reach_px, optics.reach_px)
             coefficients = optics.coefficients(star, np.clip(parameters[:, :k], -MAX_Z, MAX_Z))
-            modes = optics.mode_coefficients(star, coefficients, place)
+            modes = optics.mode_coefficients(star, coefficients, position)
             return optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
 
         def log_posterior(member: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -491,19 +491,19 @@ class WavefrontSearch:
             return np.where(is_near, height, -1e100)
 
         def approximate(
-            numbers: np.ndarray, fit_places: Mapping[int, np.ndarray]
+            numbers: np.ndarray, fit_offsets: Mapping[int, np.ndarray]
         ) -> QuadraticPosterior:
-            # Images at the same places relative to all modes, and at the places that are given.
+            # Images at the same offsets from all modes, and at the offsets that are given.
             design = draw_design(k + 2, stream(self.seed, "wavefront design"))
             roots = {}
             for number in numbers:
-                place = design
-                if number in fit_places:
-                    place = np.concatenate([design, fit_places[number][:, : k + 2]])
+                offset = design
+                if number in fit_offsets:
+                    offset = np.concatenate([design, fit_offsets[number][:, : k + 2]])
                 star, shape = modes.star[number], factor[number, : k + 2, : k + 2]
-                at = modes.parameters[number, : k + 2] + place @ shape.T
+                at = modes.parameters[number, : k + 2] + offset @ shape.T
                 roots[number] = fit_root(
-                    place,
+                    offset,
                     compute_stamps(np.full(len(at), star), at),
                     self.photons.counts[star],
                     self.flux[star],

@@ -46,6 +46,14 @@ def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarr
     return np.array([np.median(group) if group.size else np.nan for group in groups])
 
 
+def row_medians(values: np.ndarray) -> np.ndarray:
+    """Return the median (n,) of each row (n, m) without its NaN; NaN if all values are."""
+    # NaN are last in the order. A sort of all rows takes a tenth of the time of `np.nanmedian`.
+    values, count = np.sort(values, axis=1), np.count_nonzero(~np.isnan(values), axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    return np.asarray(np.take_along_axis(values, middle, axis=1).mean(axis=1))
+
+
 def count_step(values: np.ndarray) -> float:
     """Return the quantisation step of pixels (m, n), if it is above a tenth of their scatter.
 

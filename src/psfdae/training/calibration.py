@@ -78,11 +78,13 @@ class StarErrors:
         Nodes are the RMS of a pixel divided by the flux. Distances are along the leading
         `components` of the flux model.
         """
-        # Each star at each node of the noise; all are denoised together. A star of an image has
-        # several images, half of which are enough for a method that knows the field: few stars
-        # limit its half-widths, not the noise.
+        # Each star at each node of the noise; all are denoised together. Few stars of an image are
+        # drawn several times, half of which are enough for a method that knows the field: the
+        # number of stars limits its half-widths, not the noise. Every star is drawn once at least.
         draws = [stars.draw(node, rng) for node in nodes]
-        count = len(draws[0][1]) // (2 if method_fit.knows_field else 1)
+        count = len(draws[0][1])
+        if method_fit.knows_field:
+            count = max(count // 2, len(stars.images))
         draws = [(images[:count], star[:count]) for images, star in draws]
         noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
         noise = np.repeat(nodes, count)

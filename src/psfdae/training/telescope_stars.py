@@ -22,7 +22,7 @@ FIELD_POINTS = 50
 """Stars along a side of the field."""
 
 SNR = 2000.0
-"""S/N of the stars, far above the S/N to which they are degraded."""
+"""S/N of the stars over the noise of the sky, far above the S/N to which they are degraded."""
 
 SKY = 1000.0
 """Photons of the sky in a pixel."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from photutils.segmentation import deblend_sources, detect_sources
+from photutils.segmentation import SourceCatalog, SourceFinder
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -17,13 +17,7 @@ from command_line import printed, psfdae, refused
 from image_training import few_draws
 from psfdae.denoise.bundle import read_bundle
 from psfdae.image.camera import camera_values
-from psfdae.image.detection import (
-    _smooth,
-    find_sources,
-    is_on_source,
-    label_areas,
-    part_sources,
-)
+from psfdae.image.detection import _smooth, find_sources, is_on_source
 from psfdae.image.fits_file import find_image
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
@@ -67,26 +61,40 @@ def opened(path, **stated):
 # Finding
 
 
-@pytest.mark.parametrize("levels", [8, 32])
-def test_sources_are_parted_as_photutils_parts_them(levels):
-    """Groups of one to four stars of many fluxes, some of them too faint to be a part."""
-    rng = np.random.default_rng(2)
-    light = np.zeros((300, 300))
+def test_sources_are_those_of_photutils():
+    """Groups of one to four stars of many fluxes, some of them too faint to be parted."""
+    rng, shape = np.random.default_rng(2), (300, 300)
+    light = np.zeros(shape)
     middle = np.repeat(rng.uniform(20, 280, (60, 2)), rng.integers(1, 5, 60), axis=0)
     row, column = np.rint(middle + rng.normal(0, 3, middle.shape)).astype(int).T
     np.add.at(light, (row, column), 10 ** rng.uniform(2.5, 5, len(row)))
-    light = ndimage.gaussian_filter(light, 1.3)
-    image = ndimage.gaussian_filter(light + rng.normal(0, 1, light.shape), 0.8).astype(np.float32)
-    hidden = rng.uniform(size=image.shape) < 0.002
-    sources = detect_sources(image, 2.0, 5, mask=hidden)
-    options = {"n_levels": levels, "contrast": 0.005, "progress_bar": False}
-    expected = deblend_sources(image, sources, 5, **options).data
-    areas = label_areas((image > 2.0) & ~hidden, 5)
-    parts = part_sources(image, areas, 5, levels)
-    count = len(np.unique(expected)) - 1
-    assert sources.n_labels + 20 < count == len(np.unique(parts)) - 1
-    # The same pixels belong together, whatever their numbers.
-    assert len(np.unique(np.stack([expected.ravel(), parts.ravel()]), axis=1).T) == count + 1
+    image = ndimage.gaussian_filter(light, 1.3) + rng.normal(0, 1, shape)
+    sky = Sky(image, np.zeros(shape), np.ones(shape), np.zeros(shape, bool), np.nan)
+    stars = find_sources(sky, 5.0)
+    # The same pixels, which photutils parts at the same levels.
+    smooth, limit = _smooth(sky, 5.0)
+    finder = SourceFinder(5, n_levels=8, contrast=0.005)
+    finder.progress_bar = False
+    expected = SourceCatalog(image, finder(smooth, limit), convolved_data=smooth)
+    assert len(stars["id"]) == pytest.approx(len(expected), rel=0.15)
+    position = np.stack([expected.x_centroid, expected.y_centroid], axis=1)
+    measured = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
+    distance, source = cKDTree(position).query(measured)
+    is_same = distance < 0.3
+    assert is_same.mean() > 0.75 and np.median(distance) < 0.05
+    ratio = stars["FLUX_ISO"][is_same] / expected.segment_flux[source[is_same]]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.005)
+
+
+def test_a_source_may_have_any_number_of_pixels_and_peaks():
+    """More than the buffers of SEP hold by default, 300,000 pixels and 1024 peaks."""
+    wave = np.cos(np.pi / 6 * np.arange(600))
+    light, shape = 128.0 + 60.0 * (wave + wave[:, None]), (600, 600)
+    light += np.random.default_rng(1).normal(0, 1, shape)
+    sky = Sky(light, np.zeros(shape), np.ones(shape), np.zeros(shape, bool), np.nan)
+    stars = find_sources(sky, 5.0)
+    assert stars["FLUX_ISO"] == pytest.approx([light.sum()], rel=1e-6)
+    assert stars["X_IMAGE"] == pytest.approx([300.5], abs=3.0)
 
 
 def test_stars_are_found_where_they_are(field):

@@ -22,6 +22,7 @@ from psfdae.image.sky import subtract_sky
 from psfdae.image.sky_level import (
     SkyStructure,
     _smooth_meshes,
+    measure_meshes,
     noise_correlation,
     sky_level,
     sky_steps,
@@ -31,6 +32,7 @@ from psfdae.image.trails import add_trails, find_saturated_cores, find_spikes, f
 from psfdae.methods.field import FieldMixture
 from psfdae.photometry import crowded
 from psfdae.stars.bright_stars import BrightStars
+from psfdae.stars.moments import row_medians
 from psfdae.training.fitting import fit_method
 from psfdae.training.neighbours import fit_isolated_stars
 from small_field import CAMERA, SKY, drawn, moffat, noisy
@@ -671,3 +673,28 @@ def test_a_core_as_wide_as_the_image_has_no_spikes():
     image = np.random.default_rng(3).normal(100.0, 1.0, (420, 420))
     clean = np.zeros(image.shape, bool)
     assert not add_trails(image, bad_pixels.BadPixels(clean, clean, ()), 90.0).mask.any()
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8", ">f4", ">i2", "u2", "i4"])
+@pytest.mark.parametrize("level", [0.1, 7.0, 1000.123456])
+def test_meshes_of_equal_pixels_have_no_noise(dtype, level):
+    """SEP computes in single precision, and gives σ = 1 for pixels without scatter."""
+    image = np.full((100, 70), level).astype(dtype)
+    mode, sigma = measure_meshes(image, np.zeros(image.shape, bool), 64)
+    assert mode == pytest.approx(np.full((2, 2), float(image[0, 0])), rel=1e-6)
+    assert not sigma.any()
+    # Noise of σ = 1 is none of these.
+    noisy_image = image + np.random.default_rng(1).normal(0.0, 1.0, image.shape)
+    sigma = measure_meshes(noisy_image, np.zeros(image.shape, bool), 64)[1]
+    assert sigma == pytest.approx(np.ones((2, 2)), rel=0.05)
+
+
+@pytest.mark.parametrize("count", [1, 6, 7])
+def test_medians_of_rows_are_those_of_numpy(count):
+    values = np.random.default_rng(1).normal(size=(40, count)).astype(np.float32)
+    values[np.random.default_rng(2).random(values.shape) < 0.3] = np.nan
+    values[0] = np.nan
+    with np.errstate(all="ignore"), pytest.warns(RuntimeWarning, match="All-NaN"):
+        expected = np.nanmedian(values, axis=1)
+    np.testing.assert_array_equal(row_medians(values), expected)
+    assert row_medians(values[:0]).shape == (0,)

@@ -34,7 +34,7 @@ from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
 from psfdae.photometry.wings_fit import (
     StarFluxes,
     around_stars,
-    draw_tents,
+    draw_hats,
     draw_wings,
     fit_wings,
     measure_halo,
@@ -47,7 +47,7 @@ from psfdae.training.neighbours import draw_other_stars
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, FRAME = 330, 200.0, 10, 61
-RADIUS = np.geomspace(5, 25, 7)  # of the tents of wings
+RADIUS = np.geomspace(5, 25, 7)  # of the hat functions of wings
 CORE, CORE_PX, WING_PX = 0.94, 1.4, 3.0  # flux of the Gaussian, its σ, and the radius of the wings
 
 
@@ -236,7 +236,7 @@ def test_the_light_of_wings_is_the_sum_over_pixels():
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
 
 
-@pytest.mark.parametrize("name", ["place", "flux", "outer_share"])
+@pytest.mark.parametrize("name", ["position", "flux", "outer_share"])
 def test_stars_of_which_something_is_unknown_have_no_wings(name):
     wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, len(RADIUS)), np.eye(len(RADIUS)), 1.0)
     stars = StarFluxes(np.array([[40.3, 40.1], [20.0, 30.0]]), np.ones(2), np.ones(2))
@@ -270,9 +270,9 @@ def test_wings_in_tiles_are_those_of_the_whole_image():
     stars = StarFluxes(place, np.array([1.0, 2.0, 5.0]), np.ones(3))
     whole, light = draw_wings((150, 190), stars, wings), np.full((150, 190), np.nan)
     empty = 0
-    for tile, tents in draw_tents(whole.shape, stars, wings, 32):
-        empty += len(tents) == 0
-        light[tile] = np.tensordot(wings.profile[: len(tents)], tents, 1)
+    for tile, hats in draw_hats(whole.shape, stars, wings, 32):
+        empty += len(hats) == 0
+        light[tile] = np.tensordot(wings.profile[: len(hats)], hats, 1)
     assert light == pytest.approx(whole, rel=1e-5, abs=1e-12)
     assert 0 < empty < 30 and not whole[100:, 150:].any()
 
@@ -536,6 +536,7 @@ def test_errors_of_stars_on_a_halo_include_the_error_of_the_halo(sky, light, mid
     ("options", "message"),
     [
         (["x.txt"], "x.txt"),
+        (["o.csv", "--zero-point", "25", "--reference", "near.csv"], "--zero-point"),
         (["o.csv", "--reference", "far.csv"], "0 of its stars"),
         (["o.csv", "--residual", "o.csv"], "o.csv"),
     ],
@@ -649,14 +650,17 @@ def test_a_list_is_as_accurate_as_where_its_bright_stars_are():
     flux_error = np.where(np.arange(count) < 300, 1.0, 40.0)
     place[300:] += 2.0  # faint stars, which noise has moved
     fit = SimpleNamespace(
-        place=place, flux=np.full(count, 100.0), flux_error=flux_error, flags=np.zeros(count, int)
+        position=place,
+        flux=np.full(count, 100.0),
+        flux_error=flux_error,
+        flags=np.zeros(count, int),
     )
-    expected, error_px = crowded.list_places(fit, origin, fwhm)
+    expected, error_px = crowded.locate_listed_stars(fit, origin, fwhm)
     assert expected - origin == pytest.approx(np.tile([0.4, -0.2], (count, 1)), abs=0.1)
     assert error_px == pytest.approx(0.5, rel=0.15)
-    fit.place = origin.copy()
-    assert crowded.list_places(fit, origin, fwhm)[1] == pytest.approx(0.375)
-    fit.place = origin + rng.normal(0, 2.0, origin.shape)
-    assert crowded.list_places(fit, origin, fwhm) is None
+    fit.position = origin.copy()
+    assert crowded.locate_listed_stars(fit, origin, fwhm)[1] == pytest.approx(0.375)
+    fit.position = origin + rng.normal(0, 2.0, origin.shape)
+    assert crowded.locate_listed_stars(fit, origin, fwhm) is None
     fit.flags[9:] = 1
-    assert crowded.list_places(fit, origin, fwhm) is None
+    assert crowded.locate_listed_stars(fit, origin, fwhm) is None

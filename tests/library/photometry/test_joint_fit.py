@@ -61,8 +61,8 @@ def test_stars_that_overlap_are_parted_exactly(psfs, unit):
     start = place + np.random.default_rng(1).uniform(-0.5, 0.5, place.shape)
     error, bad = np.full(image.shape, unit), np.zeros(image.shape, bool)
     fit = fit_stars(psfs, image, error, bad, start, None, BOX_PX, FWHM_PX)
-    sigma = np.column_stack([fit.flux_error, fit.place_error])
-    off = np.column_stack([fit.flux - flux, fit.place - place])
+    sigma = np.column_stack([fit.flux_error, fit.position_error])
+    off = np.column_stack([fit.flux - flux, fit.position - place])
     assert (np.abs(off) < 0.2 * sigma).all()
     assert fit.flags.tolist() == [0, 0, 0, 0, 0, 1]
     assert fit.light == pytest.approx(image, abs=unit)
@@ -95,8 +95,8 @@ def test_errors_are_those_of_the_noise(psfs):
     image, error = rng.poisson(light + sky) - sky, np.sqrt(light + sky)
     start = place + rng.normal(0, 0.2, place.shape)
     fit = fit_stars(psfs, image, error, light < -1, start, None, BOX_PX, FWHM_PX)
-    pulls = np.column_stack([fit.flux - flux, fit.place - place])
-    pulls /= np.column_stack([fit.flux_error, fit.place_error])
+    pulls = np.column_stack([fit.flux - flux, fit.position - place])
+    pulls /= np.column_stack([fit.flux_error, fit.position_error])
     assert (np.abs(pulls) < 1).mean(axis=0) == pytest.approx([0.68] * 3, abs=0.1)
     assert np.median(pulls, axis=0) == pytest.approx([0.0] * 3, abs=0.25)
     assert np.median(fit.chi2) == pytest.approx(1.0, abs=0.1)
@@ -120,7 +120,7 @@ def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):
     image[bad] = np.nan
     fit = fit_stars(psfs, image, np.ones(image.shape), bad, place, np.full(4, 9e3), BOX_PX, FWHM_PX)
     assert fit.flux[0] == pytest.approx(1e4, abs=1)
-    assert np.isnan(fit.flux[1:]).all() and np.isnan(fit.place_error[1:]).all()
+    assert np.isnan(fit.flux[1:]).all() and np.isnan(fit.position_error[1:]).all()
     assert fit.flags.tolist() == [1, 64, 64, 64]
 
 
@@ -130,7 +130,7 @@ def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
     weight_and_mask = np.ones(image.shape), np.zeros(image.shape, bool)
     start, origin = place - [1.5, 0.0], place - [3.0, 0.0]
     fit = fit_stars(psfs, image, *weight_and_mask, start, None, BOX_PX, 2.0, origin)
-    assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
+    assert fit.position[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
 
 
 def test_stars_are_drawn_to_known_places_as_far_as_noise_hides_them(psfs):
@@ -145,12 +145,12 @@ def test_stars_are_drawn_to_known_places_as_far_as_noise_hides_them(psfs):
         listed = place + rng.normal(0, 0.1, place.shape)
         rest = np.full(image.shape, sigma), np.zeros(image.shape, bool), listed, None, BOX_PX
         free, drawn = (
-            fit_stars(psfs, image, *rest, FWHM_PX, place_prior=known)
+            fit_stars(psfs, image, *rest, FWHM_PX, position_prior=known)
             for known in (None, (listed, 0.1))
         )
-        ratio = np.std(drawn.place - place) / np.std(free.place - place)
+        ratio = np.std(drawn.position - place) / np.std(free.position - place)
         assert least <= ratio < most
-        pulls = (drawn.place - place) / drawn.place_error
+        pulls = (drawn.position - place) / drawn.position_error
         assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
         assert np.mean(drawn.flux / flux) == pytest.approx(1.0, abs=0.15 / snr * 3)
 

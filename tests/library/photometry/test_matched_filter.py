@@ -68,6 +68,17 @@ def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
     assert snr[at] == pytest.approx(expected * np.sqrt(information), rel=0.3)
 
 
+@pytest.mark.parametrize("flux", [1e4, 1e6, 1e7, 1e8, 1e10])
+def test_nothing_is_found_in_the_light_of_a_star_of_any_brightness(flux):
+    """Where the errors of its model make σ so large that single precision rounds 1/σ² to 0."""
+    rng, grid, star = np.random.default_rng(4), gaussian_grid(3.2), np.array([[100.3, 99.8]])
+    sigma = np.hypot(1.0, 0.03 * lit(grid, star, [flux]))
+    residual = rng.normal(0.0, sigma) + lit(grid, np.array([[40.0, 60.5]]), [60.0])
+    position, found_flux = find_stars(grid, residual, sigma, star, 6.0, 3.2)
+    assert np.hypot(*(position - [40.0, 60.5]).T) == pytest.approx([0.0], abs=0.6)
+    assert found_flux == pytest.approx([60.0], rel=0.3)
+
+
 @pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
 @pytest.mark.parametrize("fwhm", [1.6, 3.2, 8.0])
 def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):

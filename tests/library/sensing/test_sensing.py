@@ -192,8 +192,8 @@ def test_draws_are_of_the_posterior_whatever_the_approximation(offset, exact_per
         evaluated.append(len(at))
         return -0.5 * ((at - 1.0) ** 2).sum(axis=1)
 
-    def approximate(modes, places):
-        return lambda mode, place: -0.5 * ((place - [offset, 0.0]) ** 2).sum(axis=1) + 7.0
+    def approximate(modes, offsets):
+        return lambda mode, at: -0.5 * ((at - [offset, 0.0]) ** 2).sum(axis=1) + 7.0
 
     def twin(owner, at):
         return at, np.full(len(at), -np.inf)
@@ -233,12 +233,12 @@ def test_quadratic_images_give_the_posterior_of_counts_with_their_variance_at_th
     images = image(mean[:3] + design @ factor[:3, :3].T)
     root = fit_root(design, images, counts, unit, sky, mean[3])
     posterior = QuadraticPosterior(mean[None], factor[None], precision, {0: root})
-    place = rng.standard_normal((40, 5))
-    at = mean + place @ factor.T
+    offset = rng.standard_normal((40, 5))
+    at = mean + offset @ factor.T
     expected = unit * at[:, 3:4] * image(at[:, :3]) + sky + sky**0.5 * at[:, 4:]
     variance = unit * mean[3] * image(mean[:3]) + sky
     chi2 = np.nansum((counts - expected) ** 2 / variance, axis=1)
-    height = posterior(np.zeros(40, int), place)
+    height = posterior(np.zeros(40, int), offset)
     assert height == pytest.approx(-0.5 * (chi2 + at**2 @ precision), rel=1e-4)
 
 

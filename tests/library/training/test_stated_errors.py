@@ -12,15 +12,16 @@ from astropy.table import Table
 import psfdae
 from command_line import printed
 from psfdae.denoise.error_model import ErrorModel, ModelErrors
+from psfdae.denoise.flux_model import FluxModel
 from psfdae.image.image_input import ImageInput
 from psfdae.image.opening import open_observation
 from psfdae.image.stamps import StarFlag
 from psfdae.methods.field import FieldMixture
 from psfdae.methods.field.errors import excess_scatter
-from psfdae.methods.interface import FitError
+from psfdae.methods.interface import Estimate, FitError
 from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
 from psfdae.stars.noise import NoiseModel
-from psfdae.training.calibration import fit_model_errors, fit_noise_floor
+from psfdae.training.calibration import StarErrors, fit_model_errors, fit_noise_floor
 from psfdae.training.fitting import describe_settings, fit_method
 from psfdae.training.packing import add_wings, build_uncalibrated
 from psfdae.training.star_sets import HeldOutStars
@@ -130,6 +131,26 @@ def test_a_field_whose_stars_cannot_be_measured_is_an_error_of_one_line(flag):
     field = SimpleNamespace(knows_field=True, draw_stars=draw_stars)
     with pytest.raises(psfdae.Error, match="stars drawn from the fitted field"):
         fit_model_errors(model, field, 1)
+
+
+@pytest.mark.parametrize("stars", [3, 130, 260])
+def test_half_widths_of_a_field_are_those_of_all_its_stars(stars):
+    """Few stars are drawn several times; of many, none is left out."""
+    image, rng = np.eye(3)[None] / 3, np.random.default_rng(1)
+    truth, zeros = image.repeat(stars, axis=0), np.zeros((stars, 3, 3))
+    held_out = HeldOutStars(
+        truth, truth, NoiseModel(1000.0, 1.0), zeros[:, 0, :2], zeros[:, 0, 0], zeros
+    )
+
+    def estimate(noisy, level, position):
+        return Estimate(noisy, outlier_score=np.zeros(len(noisy)))
+
+    method = SimpleNamespace(knows_field=True, estimate=estimate)
+    mean = image.ravel()
+    flux_model = FluxModel(mean, np.eye(9), np.full(9, 1e-4), mean, mean)
+    errors = StarErrors.measure(held_out, method, flux_model, np.array([1e-3, 1e-2]), 0, rng)
+    assert np.unique(errors.star).tolist() == list(range(stars))
+    assert errors.error.shape == (2, len(errors.star), 3, 3) and len(errors.star) >= 125
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ def left_out_stars(
     fit : FieldFit
         Fit that has their fluxes, centres and weights.
     options : FitOptions, optional
-        Options of the splines that are fitted; by default those of the fit. All options are
+        Options of the splines that are fitted; by default the options of the fit. All options are
         compared on the same stars, of the same weights.
     """
     settings, model = fitter.settings, fit.model
@@ -86,7 +86,7 @@ def left_out_stars(
     noise = fitter.pixel_variance(fit.flux, star_images)
     weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
     good_weight = weight * fit.good[:, None, None]
-    # Splines begin at those of the fit, or at those of other options fitted to all stars.
+    # Splines begin at the splines of the fit, or of other options fitted to all stars.
     if options is None:
         options = fit.options
     else:

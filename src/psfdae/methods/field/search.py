@@ -130,8 +130,8 @@ def choose_spacing(stars: BrightStars, spacing: float) -> float:
     return float(np.clip(0.7 * sigma_px, spacing, 2.0 * spacing))
 
 
-class _Comparison:
-    """Comparison of options by the prediction of left-out stars, at the centres of one fit.
+class CrossValidation:
+    """Cross-validation of options: their predictions of left-out stars, at the centres of one fit.
 
     Squared errors of the same stars are compared by the mean difference of their logarithms, which
     gives faint and bright stars the same influence.
@@ -148,30 +148,30 @@ class _Comparison:
         self.fitter, self.fit = fitter, fit
         self._predictions: dict[FitOptions, tuple[Iterator[LeftOut], list[np.ndarray]]] = {}
 
-    def is_better(self, options: FitOptions, others: FitOptions, factor: float = 1.0) -> bool:
-        """Return True if the squared errors are smaller than with other options, times a factor.
+    def is_better(self, options: FitOptions, reference: FitOptions, factor: float = 1.0) -> bool:
+        """Return True if the squared errors are smaller than with the reference, times a factor.
 
         The comparison ends after as many folds as show the difference at 4 σ.
         """
         gain = np.empty(0)
         for fold in range(self.fitter.settings.folds):
-            errors, other_errors = (self._fold_errors(o, fold) for o in (options, others))
-            gain = np.append(gain, other_errors - errors + np.log(factor))
+            errors, reference_errors = (self._fold_errors(o, fold) for o in (options, reference))
+            gain = np.append(gain, reference_errors - errors + np.log(factor))
             if len(gain) >= 20 and abs(gain.mean()) > 4.0 * gain.std() / np.sqrt(len(gain)):
                 break
         return bool(gain.mean() > 0)
 
     def find_best(self, steps: Sequence[FitOptions], first: int = 0) -> FitOptions:
         """Return the best of options in their order, from the first on, upwards or else down."""
-        best = first
+        index = first
         for direction in (1, -1):
-            while 0 <= (number := best + direction) < len(steps) and self.is_better(
-                steps[number], steps[best]
+            while 0 <= (number := index + direction) < len(steps) and self.is_better(
+                steps[number], steps[index]
             ):
-                best = number
-            if best != first:
+                index = number
+            if index != first:
                 break
-        return steps[best]
+        return steps[index]
 
     def _fold_errors(self, options: FitOptions, fold: int) -> np.ndarray:
         """Return ln of the squared errors of the stars of a fold; empty after the last fold."""
@@ -207,13 +207,13 @@ def _search_options(
     curved_order = 2
     first_order = max((o for o in orders if o <= curved_order), default=orders[0])
     options = replace(options, order=first_order, tolerance=fitter.settings.compared_tolerance)
-    comparison, options = _search_splines(fitter, options, first_spacing)
+    validation, options = _search_splines(fitter, options, first_spacing)
     # Orders from the lowest to the first one that does not pay.
     order_steps = [replace(options, order=order) for order in orders]
     options = order_steps[0]
     for step in order_steps[1:]:
         # Most fields are curved. Higher orders must pay clearly, because noise may favour them.
-        if comparison.is_better(step, options, 1.0 if step.order <= curved_order else 0.99):
+        if validation.is_better(step, options, 1.0 if step.order <= curved_order else 0.99):
             options = step
         elif step.order >= curved_order:
             break
@@ -222,8 +222,8 @@ def _search_options(
     coordinates = [c for c in range(2, len(fitter.high)) if fitter.high[c] > fitter.low[c]]
     while coordinates:
         steps = [replace(options, star_terms=(*options.star_terms, c)) for c in coordinates]
-        step = comparison.find_best(steps)
-        if not comparison.is_better(step, options, 0.98):
+        step = validation.find_best(steps)
+        if not validation.is_better(step, options, 0.98):
             break
         options = step
         coordinates.remove(step.star_terms[-1])
@@ -236,7 +236,7 @@ def _search_options(
 
 def _search_splines(
     fitter: FieldFitter, options: FitOptions, first_spacing: float
-) -> tuple[_Comparison, FitOptions]:
+) -> tuple[CrossValidation, FitOptions]:
     """Search the distance of knots, then the smoothness, that predict left-out stars best.
 
     Parameters
@@ -250,7 +250,7 @@ def _search_splines(
 
     Returns
     -------
-    comparison : _Comparison
+    validation : CrossValidation
         Comparison at the centres of a fit with the first distance.
     options : FitOptions
         The best options.
@@ -262,10 +262,10 @@ def _search_splines(
         knot_steps.append(replace(options, knots=count_knots(frame_px, spacing)))
     spacings = np.array([compute_spacing(frame_px, step.knots) for step in knot_steps])
     first = int(np.abs(np.log(spacings / first_spacing)).argmin())
-    comparison = _Comparison(fitter, fitter.fit(knot_steps[first]))
-    options = comparison.find_best(knot_steps, first)
+    validation = CrossValidation(fitter, fitter.fit(knot_steps[first]))
+    options = validation.find_best(knot_steps, first)
     # Splines ten times as smooth, at most three times.
-    return comparison, comparison.find_best(
+    return validation, validation.find_best(
         [replace(options, smoothness=10.0**k * options.smoothness) for k in range(4)]
     )
 
