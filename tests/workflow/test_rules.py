@@ -181,7 +181,7 @@ def test_files_of_a_fit_are_below_the_results_with_the_rule_s_wildcards():
         RUN, "pca_som", "dataset3", "random", "template"
     )
     params = fits.fit_params(RUN, "pca_som")
-    assert params["place"] == "out/pca_som/{dataset}/{split}.h5"
+    assert params["path"] == "out/pca_som/{dataset}/{split}.h5"
     assert params["more"](wildcards(dataset="dataset3", split="random"), {}) == []
 
 
