@@ -307,7 +307,9 @@ def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.n
     ring[start : start + hole_px, start : start + hole_px] = False
     # Dither whole counts, so that medians are not rounded.
     step = count_step(np.where(bad, np.nan, window).reshape(-1, side))
-    window, dither_variance = dither(window, step)
+    # In double precision, which the window has only in another unit than the image's own: rounding
+    # must not depend on the unit.
+    window, dither_variance = dither(window.astype(np.float64), step)
     # Pixels of the ring more than 3 σ off their median belong to other stars.
     values = np.where(bad[:, ring], np.nan, window[:, ring])
     with warnings.catch_warnings():
