@@ -1,5 +1,6 @@
 # Timings: each takes all cores, so that no other job disturbs it, and leaves one table; others,
-# which measure no time, run side by side.
+# which measure no time, run side by side. Costs are CPU time on one thread: two of them share the
+# cores.
 # Programs are in workflow/benchmarks, named by file and function.
 rule cost:
     input:
@@ -13,7 +14,7 @@ rule cost:
         f"{RESULTS}/benchmarks_on_request/benchmark/{{dataset}}-{{method}}-{{point}}.tsv"
     wildcard_constraints:
         method=r"\w+",
-    threads: workflow.cores
+    threads: max(1, workflow.cores // 2)
     resources:
         mem_mb=2000,
         runtime=30,

@@ -282,7 +282,8 @@ def sample_stars(
 
     The samples are returned for an unknown and for a known field.
     """
-    posteriors = StarPosteriors(stars.noisy[level], likelihood, build_stamp_model(config))
+    model = build_stamp_model(config).coarsen(likelihood)
+    posteriors = StarPosteriors(stars.noisy[level], likelihood, model)
     # Bounds need every mode: more starts than in a method, and more for doubtful stars.
     modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=2.0)
     true_modes = climb(get_true_modes(posteriors.model, product, stars), posteriors)

@@ -24,7 +24,13 @@ from psfdae.sensing.climbing import (
     poisson_information,
 )
 from psfdae.sensing.climbing import climb as climb_posterior
-from psfdae_paper.bounds.modes import Knowledge, Modes, select_largest, separate
+from psfdae_paper.bounds.modes import (
+    Knowledge,
+    Modes,
+    rank_in_group,
+    select_largest,
+    separate,
+)
 from psfdae_paper.bounds.posterior import Bank, group_by_field, list_jitters, score_bank
 from psfdae_paper.bounds.stamp_model import StarPosteriors
 from psfdae_paper.stars.symmetry import SYMMETRIES
@@ -69,42 +75,47 @@ def search(
     misfits : ndarray of int
         Stars that are not explained by any mode (`find_unexplained`).
     """
-
-    def bank_starts(stars: np.ndarray, fields: int, offsets: int) -> Modes:
-        """Return the best matches of the stars with these numbers, unchanged and recentred."""
-        field = None if star_field is None else star_field[stars]
-        matches = []
-        # Stars of one group share the part of the bank that may explain them.
-        for group, members in group_by_field(stars.size, None if in_all_fields else field, bank):
-            in_group = find_best_matches(
-                bank.take(members),
-                posteriors.take(stars[group]),
-                fields if in_all_fields else 0,
-                offsets,
-                None if field is None else field[group],
-            )
-            matches.append(replace(in_group, star=stars[group][in_group.star]))
-        starts = Modes.join(matches)
-        return Modes.join([starts, recentre(starts, posteriors)])
-
-    # First from a few matches of every star.
-    modes = climb(bank_starts(np.arange(len(posteriors.noisy)), fields, offsets), posteriors)
-    # Then from 16 fields or offsets for stars that the modes do not explain, and twice from all
-    # around the best modes of stars that are still not explained.
+    # The bank's best matches of every star, best first. Stars of one group share the part of the
+    # bank that may explain them.
+    count, matches = len(posteriors.noisy), []
+    for stars, members in group_by_field(count, None if in_all_fields else star_field, bank):
+        in_group = find_best_matches(
+            bank.take(members),
+            posteriors.take(stars),
+            max(fields, 16) if in_all_fields else 0,
+            max(offsets, 16),
+            None if star_field is None else star_field[stars],
+        )
+        matches.append(replace(in_group, star=stars[in_group.star]))
+    starts = Modes.join(matches)
+    # First from a few matches of every star, unchanged and recentred.
+    few = np.where(starts.knowledge == Knowledge.NONE, fields, offsets)
+    is_first = rank_in_group(starts.group, np.arange(starts.star.size)) < few
+    first = starts.select(is_first)
+    modes = climb(add_elsewhere(recentre(first, posteriors), first), posteriors)
+    # Then from the other matches of stars that the modes do not explain, and twice from all around
+    # the best modes of stars that are still not explained.
     for attempt in range(3):
-        misfits = find_unexplained(modes, posteriors, misfit_sigma)
-        if not misfits.size:
+        misfits = find_unexplained(select_best(modes, star_field), posteriors, misfit_sigma)
+        if not misfits.star.size:
             break
         if attempt == 0:
-            starts = bank_starts(misfits, 16, 16)
+            further = starts.select(~is_first & np.isin(starts.star, misfits.star))
+            if not further.star.size:
+                continue
+            trials = add_elsewhere(recentre(further, posteriors), further)
         else:
-            starts = recentre(place_corners(modes, misfits), posteriors)
-        modes = climb(Modes.join([modes, starts]), posteriors)
+            trials = recentre(place_corners(misfits), posteriors)
+        # Their modes climb along, so that climbs far below these are abandoned.
+        is_misfit = np.isin(modes.star, misfits.star)
+        trials = climb(Modes.join([modes.select(is_misfit), trials]), posteriors)
+        modes = Modes.join([modes.select(~is_misfit), trials])
     # Finally in other fields and at other offsets that give nearly the same image.
     if in_all_fields:
         modes = climb(Modes.join([modes, find_twins(modes, posteriors)]), posteriors)
     # χ² four standard deviations above its mean: no mode explains the star.
-    return modes, find_unexplained(modes, posteriors, 4.0)
+    best = select_best(modes, star_field)
+    return modes, np.unique(find_unexplained(best, posteriors, 4.0).star)
 
 
 def find_best_matches(
@@ -191,20 +202,36 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
 
 
 def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
-    """Refine modes with a free stamp offset, rounded to whole pixels.
+    """Refine starts with a free stamp offset, rounded to whole pixels.
 
     A stamp that is off by a pixel leads to another mode, mostly a wrong one, from which steps of
-    whole pixels do not lead back.
+    whole pixels do not lead back. A place that several starts reach is returned once.
     """
     # Prior of the shift along rows and columns: normal, with this standard deviation.
     shift_sd_px = 1.5
     tilts = shift_sd_px * posteriors.model.tilt_coefficients(np.eye(2))
     # A tilt that moves the image by +u replaces an offset of the stamp by −u.
     # Unknowns are z, then the shift in units of its standard deviation.
-    parameters = _climb_along(modes, posteriors, tilts).parameters
-    z, shifts = np.split(parameters, [modes.z.shape[1]], axis=1)
+    peaks, terms = _climb_along(modes, posteriors, tilts), modes.z.shape[1]
+    z, shifts = np.split(peaks.parameters, [terms], axis=1)
     offset = modes.offset - np.rint(shift_sd_px * shifts).astype(int)
-    return Modes.make_starts(modes.star, modes.field, offset, modes.knowledge, z)
+    # Many climbs end at the same maximum, and offsets are whole pixels: the best free maxima are
+    # the best places to start from, each once.
+    covariance, evidence = peaks.laplace()
+    factor = np.linalg.cholesky(covariance[:, :terms, :terms])
+    places = separate(replace(modes, offset=offset, z=z, factor=factor, evidence=evidence))
+    return Modes.make_starts(places.star, places.field, places.offset, places.knowledge, places.z)
+
+
+def add_elsewhere(places: Modes, starts: Modes) -> Modes:
+    """Add to recentred places the starts in whose field and at whose offset their star has none.
+
+    At an offset that a place has, an unchanged start would lead to the same mode.
+    """
+    cells = [np.column_stack([modes.star, modes.field, modes.offset]) for modes in (places, starts)]
+    _, number = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
+    of_places, of_starts = np.split(number.ravel(), [places.star.size])
+    return Modes.join([places, starts.select(~np.isin(of_starts, of_places))])
 
 
 def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.ndarray) -> Peaks:
@@ -239,47 +266,69 @@ def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.
     return climb_posterior(evaluate, start, model.max_abs_z, steps, modes.group)
 
 
-def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> np.ndarray:
-    """List the stars whose best mode does not explain their image, without or with their field.
-
-    A star is unexplained if χ² = Σ (n − μ)²/μ is more than `misfit_sigma` standard deviations above
-    its mean for the right mode (`compute_deviance_limit`).
+def select_best(modes: Modes, star_field: np.ndarray | None) -> Modes:
+    """Select the best mode of every star: of all found without its field, and of all in its field.
 
     Parameters
     ----------
     modes : Modes
         Results of `climb`.
+    star_field : ndarray of int, shape (n,), optional
+        Fields of the stars, if they are known.
+
+    Returns
+    -------
+    Modes
+        At most two for every star. A mode that is the best in the star's field only has the
+        knowledge `Knowledge.FIELD`.
+    """
+
+    def best_of(numbers: np.ndarray) -> np.ndarray:
+        return np.asarray(numbers[select_largest(modes.star[numbers], modes.evidence[numbers], 1)])
+
+    blind = best_of(np.flatnonzero(modes.knowledge == Knowledge.NONE))
+    if star_field is None:
+        return modes.select(blind)
+    # The best mode in the field may have been found without knowledge of it.
+    in_field = best_of(np.flatnonzero(modes.field == star_field[modes.star]))
+    in_field_only = modes.select(np.setdiff1d(in_field, blind))
+    knowledge = np.full(in_field_only.star.size, Knowledge.FIELD)
+    return Modes.join([modes.select(blind), replace(in_field_only, knowledge=knowledge)])
+
+
+def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> Modes:
+    """Select the modes that do not explain the image of their star.
+
+    They do not if χ² = Σ (n − μ)²/μ is more than `misfit_sigma` standard deviations above its mean
+    for the right mode (`compute_deviance_limit`).
+
+    Parameters
+    ----------
+    modes : Modes
+        Results of `select_best`.
     posteriors : StarPosteriors
         Photon counts and likelihood of the stars, and the model of their stamps.
     misfit_sigma : float
         Allowed excess of χ² in standard deviations.
-
-    Returns
-    -------
-    ndarray of int
-        Numbers of the stars, ascending.
     """
-    modes = modes.best_of_group
     stamps = posteriors.model.stamps(modes.z, modes.field, modes.offset).astype(np.float64)
     # χ² of the photons about the counts that the mode predicts.
     mean_counts = posteriors.likelihood.predict_counts(stamps.reshape(len(stamps), -1))
     chi2 = ((posteriors.counts[modes.star] - mean_counts) ** 2 / mean_counts).sum(axis=1)
-    return np.unique(modes.star[chi2 > compute_deviance_limit(mean_counts.shape[1], misfit_sigma)])
+    return modes.select(chi2 > compute_deviance_limit(mean_counts.shape[1], misfit_sigma))
 
 
-def place_corners(modes: Modes, stars: np.ndarray) -> Modes:
-    """Place starts all around the best modes of the stars with these numbers.
+def place_corners(modes: Modes) -> Modes:
+    """Place starts all around modes.
 
     They are for stars whose climbs have ended in local maxima: a climb that starts next to such a
     maximum mostly ends elsewhere. Starts are the 2⁵ corners of a cube around the mode, 0.5 away
     in every coefficient.
     """
-    modes = modes.best_of_group
-    stuck = np.flatnonzero(np.isin(modes.star, stars))
-    # Every stuck mode with every combination of signs.
+    # Every mode with every combination of signs.
     signs = np.array(list(product((-1.0, 1.0), repeat=modes.z.shape[1])))
-    start = modes.select(np.repeat(stuck, len(signs)))
-    z = start.z + 0.5 * np.tile(signs, (stuck.size, 1))
+    start = modes.select(np.repeat(np.arange(modes.star.size), len(signs)))
+    z = start.z + 0.5 * np.tile(signs, (modes.star.size, 1))
     return Modes.make_starts(start.star, start.field, start.offset, start.knowledge, z)
 
 

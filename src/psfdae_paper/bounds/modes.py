@@ -88,11 +88,6 @@ class Modes(Rows):
         return np.asarray(len(Knowledge) * self.star + self.knowledge)
 
     @property
-    def best_of_group(self) -> Modes:
-        """Best mode of every star, without and with its field known."""
-        return self.select(select_largest(self.group, self.evidence, 1))
-
-    @property
     def mixture(self) -> Mixture:
         """Student's t around the modes."""
         return Mixture(self.z, self.factor, self.evidence)
@@ -156,12 +151,21 @@ class Modes(Rows):
         return Positions(self.field[mode], self.offset[mode], self.mixture.draw(mode, rng)), number
 
 
+def rank_in_group(group: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """Return the rank of each member among its group in ascending order of a key, all (M,)."""
+    # Sorted by group, then by key; the rank is the distance from the group's first member.
+    order = np.lexsort((key, group))
+    _, first, number = np.unique(group[order], return_index=True, return_counts=True)
+    rank = np.empty(order.size, int)
+    rank[order] = np.arange(order.size) - np.repeat(first, number)
+    return rank
+
+
 def select_largest(group: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
     """Return the numbers of the `count` members of every group that have the largest values."""
-    # Sorted by group, the largest first; then the rank of each member within its group.
+    # Sorted by group, the largest first.
     order = np.lexsort((-value, group))
-    _, first, number = np.unique(group[order], return_index=True, return_counts=True)
-    return order[np.arange(order.size) - np.repeat(first, number) < count]
+    return order[rank_in_group(group, -value)[order] < count]
 
 
 def separate(modes: Modes) -> Modes:

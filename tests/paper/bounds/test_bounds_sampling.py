@@ -11,7 +11,14 @@ from scipy.stats import multivariate_t
 from psfdae.base.rng import stream
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.bounds.mixture import Mixture
-from psfdae_paper.bounds.mode_search import climb, find_twins, recentre
+from psfdae_paper.bounds.mode_search import (
+    add_elsewhere,
+    climb,
+    find_twins,
+    find_unexplained,
+    recentre,
+    select_best,
+)
 from psfdae_paper.bounds.modes import Knowledge, Modes
 from psfdae_paper.bounds.posterior import Likelihood, list_jitters, merge
 from psfdae_paper.bounds.sampling import sample_posterior
@@ -210,6 +217,59 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
         back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
+
+
+def test_a_place_that_several_starts_reach_is_returned_once(stars, model, noise):
+    z, truth, noisy, offset = stars
+    posteriors = StarPosteriors(noisy, Likelihood.from_noise(noise, LEVEL, truth), model)
+    number = np.repeat(np.arange(len(z)), 5)
+    knowledge = np.full(number.size, Knowledge.FIELD)
+    beside = z[number] + np.outer(np.tile(np.linspace(-0.2, 0.2, 5), len(z)), np.ones(5))
+    starts = Modes.make_starts(number, 0 * number, offset[number], knowledge, beside)
+    places = recentre(starts, posteriors)
+    assert np.bincount(places.star).tolist() == [1, 1, 1, 1]
+    # A start elsewhere is added unchanged, starts at the places are not.
+    far = replace(starts, offset=starts.offset + 5)
+    assert add_elsewhere(places, starts).star.size == 4
+    assert add_elsewhere(places, far).star.size == 4 + number.size
+
+
+def test_a_mode_found_without_the_field_explains_the_star_in_its_field(modes, stars, model, noise):
+    """Poorer modes that were found with the field known do not make a star unexplained."""
+    posteriors = StarPosteriors(stars[2], Likelihood.from_noise(noise, LEVEL, stars[1]), model)
+    star_field = np.zeros(4, int)
+    blind = modes.select(modes.field == 0)
+    poor = replace(blind, offset=blind.offset + 3, evidence=blind.evidence - 40.0)
+    poor = replace(poor, knowledge=np.full(poor.star.size, Knowledge.FIELD))
+    both = Modes.join([blind, poor])
+    assert not find_unexplained(select_best(both, star_field), posteriors, 4.0).star.size
+    # Alone, they leave all stars unexplained, each of which is named with its field known.
+    alone = find_unexplained(select_best(poor, star_field), posteriors, 4.0)
+    assert alone.star.tolist() == [0, 1, 2, 3]
+    assert (alone.knowledge == Knowledge.FIELD).all()
+
+
+def test_coarse_pupil_grids_are_used_only_where_the_noise_hides_their_error(scene1, noise):
+    """The stamps' error is the one that `StampModel.coarsen` compares with the noise."""
+    rng, mean = np.random.default_rng(3), np.array(scene1.wavefront.coefficients)
+    groups = scene1.telescope, scene1.optics, scene1.framing
+    fine = StampModel(mean, 0.5 * np.abs(mean), FIELDS, *groups)
+    z, field = rng.standard_normal((200, 5)), rng.integers(0, len(FIELDS), 200)
+    offset = rng.integers(-1, 2, (200, 2))
+    bright, faint = (
+        fine.coarsen(Likelihood(noise.flux(level), noise.background, np.zeros(256)))
+        for level in (9e-5, 3e-4)
+    )
+    assert (bright.is_coarse, faint.is_coarse) == (False, True)
+    coefficients, directions = fine.coefficients(z, field), fine.directions(field)
+    exact, _ = fine.derivatives(coefficients, directions, offset, np.full(200, 318), "complex128")
+    errors = [
+        ((model.stamps(z, field, offset).reshape(200, -1) - exact) ** 2).mean(axis=1)
+        for model in (fine, faint)
+    ]
+    assert errors[0].mean() < 2e-10
+    assert 1e-10 < errors[1].mean() < 6e-10
+    assert errors[1].max() < 4e-9
 
 
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):

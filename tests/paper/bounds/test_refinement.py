@@ -10,7 +10,7 @@ import pytest
 from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.bounds.estimates import build_stamp_model
-from psfdae_paper.bounds.mode_search import climb
+from psfdae_paper.bounds.mode_search import climb, select_best
 from psfdae_paper.bounds.modes import Knowledge, Modes
 from psfdae_paper.bounds.posterior import Likelihood
 from psfdae_paper.bounds.refinement import (
@@ -169,7 +169,7 @@ def test_refined_wavefront_is_the_maximum_of_the_posterior(model, monkeypatch):
     likelihood = Likelihood.from_noise(NOISE, level, stamps)
     star = np.arange(12)
     starts = Modes.make_starts(star, field, offset, np.full(12, Knowledge.FIELD), z)
-    modes = climb(starts, StarPosteriors(noisy, likelihood, model)).best_of_group
+    modes = select_best(climb(starts, StarPosteriors(noisy, likelihood, model)), field)
     expected = model.stamps(modes.z, modes.field, modes.offset).reshape(12, -1)
     monkeypatch.setattr(Refiner, "min_gain", 1e-6)
     monkeypatch.setattr(Refiner, "max_steps", 10)
