@@ -25,7 +25,8 @@ def join(values, form="{}"):
 
 def readme():
     """Times of the run of record, and errors of one dataset and of a sweep."""
-    run = tables.provenance()
+    sizes = ("environment_mb", "results_mb", "peak_mb", "matrix_product_gflops")
+    run = tables.provenance("cores", "cpu", "install_s", "wall_s", "tests_s", "cpu_s", *sizes)
     jobs = tables.read_record("runtime.csv")
     training_s = jobs[jobs.rule == "train"].cpu_s.sum()
     yield f"On {run['cores']} cores of the machine of the record ({run['cpu']}, "
@@ -232,7 +233,8 @@ def optics_row(telescope, stamp_px):
 
 def reproduce():
     """Times of the targets on request, and the scatter between seeds."""
-    minutes = {name: value / 60 for name, value in tables.provenance()["on_request_s"].items()}
+    seconds = tables.provenance("on_request_s")["on_request_s"]
+    minutes = {name: value / 60 for name, value in seconds.items()}
     yield f"`make stability` took {minutes['stability']:.1f} min"
     yield f"`make bounds` {minutes['bounds']:.1f} min and "
     yield f"`make benchmark` {minutes['benchmark']:.0f} min"
@@ -242,7 +244,7 @@ def reproduce():
 
 def results():
     """Errors of the DAE, its input and the mixture; the alignment; run times."""
-    run = tables.provenance()
+    run = tables.provenance("commit", "wall_s", "cores")
     yield f"{run['commit']:.12}, preset `fast`, {run['wall_s'] / 60:.1f} min on "
     yield f"min on {run['cores']} cores."
     rows = tables.read_record("tables/psf_metrics.csv").query("metric == 'mse'")

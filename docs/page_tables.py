@@ -47,7 +47,7 @@ HEADINGS = {
 }
 """Headings of the columns of methods."""
 MB_PER_MIB = 2**20 / 1e6
-"""Columns `peak_mb` and `memory_mb` are in MiB, but those of `scaling_stages.csv`; pages in MB."""
+"""Columns `peak_mb`, `memory_mb` are in MiB, of `scaling_stages` and `benchmark_images` in MB."""
 
 LEVEL = {"dataset": "{dataset}", "λ": "{noise_level}"}
 """Columns that name a noise level."""
@@ -73,9 +73,17 @@ def read_study(name: str) -> pd.DataFrame:
     return pd.read_csv(ROOT / "studies" / name)
 
 
-def provenance() -> dict[str, object]:
-    """Read how and where the run of record was made."""
-    return dict(json.loads((RECORD / "provenance.json").read_text(encoding="utf-8")))
+def provenance(*names: str) -> dict[str, object]:
+    """Read how and where the run of record was made.
+
+    `names` are entries that a page needs: one that is missing or null, such as the CPU time of a
+    run with a job whose log lacks it, is an error.
+    """
+    path = RECORD / "provenance.json"
+    run = dict(json.loads(path.read_text(encoding="utf-8")))
+    if unknown := [name for name in names if run.get(name) is None]:
+        raise ValueError(f"{path}: {', '.join(unknown)} not known; run the record again")
+    return run
 
 
 def recorded(path: Path) -> str:

@@ -76,7 +76,7 @@ class Stars(ImageStars):
     --------
     >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
     >>> stars
-    Stars('array', 36 stars (29 to learn from, 7 held out) of 36)
+    Stars('array', 36 stars (29 training stars, 7 held out) of 36)
     >>> [str(part) for part in stars.table["part"][:2]]
     ['training', 'held out']
     """

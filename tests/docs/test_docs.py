@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import re
 import sys
@@ -27,6 +28,19 @@ def test_numbers_in_sentences_are_those_of_the_tables(page):
     text = " ".join(read(page).split())
     expected = [" ".join(sentence.split()) for sentence in sentences.SENTENCES[page]()]
     assert expected and [sentence for sentence in expected if sentence not in text] == []
+
+
+@pytest.mark.parametrize("name", ["cpu_s", "tests_s", "install_s", "peak_mb"])
+@pytest.mark.parametrize("is_null", [True, False])
+def test_a_record_without_a_number_of_the_readme_is_named(name, is_null, monkeypatch, tmp_path):
+    """The CPU time is null if the log of a job lacks it: its division ended in a TypeError."""
+    run = tables.provenance()
+    del run[name]
+    text = json.dumps(run | ({name: None} if is_null else {}))
+    (tmp_path / "provenance.json").write_text(text)
+    monkeypatch.setattr(tables, "RECORD", tmp_path)
+    with pytest.raises(ValueError, match=f"provenance.json: {name} not known; run the record"):
+        [*sentences.readme()]
 
 
 def test_the_prose_in_the_readme_has_no_other_number():

@@ -92,8 +92,8 @@ def test_the_lines_of_the_pages_run(training, tmp_path, monkeypatch):
 
 
 def test_held_out_stars_are_not_trained_on(training, stars):
-    learnt = np.unique(stars.product["field_index"][: SIZES["train_stars"]])
-    assert not stars.held_out[learnt].any()
+    trained = np.unique(stars.product["field_index"][: SIZES["train_stars"]])
+    assert not stars.held_out[trained].any()
     assert training.model.info.training_stars == (~stars.held_out).sum()
 
 

@@ -147,6 +147,34 @@ def test_a_tool_that_fails_has_rows_without_costs(tmp_path, monkeypatch):
     assert table["cpu_s"].isna().all() and (table["stars"] == 20).all() and len(table) == 4
 
 
+def test_each_image_has_its_own_rows_whatever_its_folder(tmp_path, monkeypatch):
+    """Two images of one name shared a row of the ratios; the same image again is one."""
+    paths = [tmp_path / name for name in ("a/field.fits", "b/field.fits", "b/s64_9.fits", "c.fits")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        fits.writeto(path, np.zeros((4, 5)))
+    names = image_costs.name_images([(64, 9), *paths])
+    assert names == ["s64_9", "a/field.fits", "b/field.fits", "b/s64_9.fits", "c"]
+    cost = iter([1.0, 2.0, 4.0, 4.0, 8.0, 1.0, 3.0, 6.0])
+    monkeypatch.setattr(image_costs, "extract_commit", lambda *arguments: image_costs.ROOT)
+    monkeypatch.setattr(image_costs, "list_peer_runs", lambda *arguments: [])
+    monkeypatch.setattr(
+        image_costs, "measure_process", lambda *_: {"cpu_s": next(cost), "peak_mb": 1.0}
+    )
+    words = [*map(str, (*paths[:2], paths[0])), "--fields", "", "--growth", ""]
+    run = CliRunner().invoke(image_costs.compare_tools, [*words, "--results", str(tmp_path / "r")])
+    # train and photometry of psfdae, then of the earlier commit.
+    text = " ".join(run.output.split("CPU time over the earlier commit's:")[1].split())
+    assert text.startswith("image step a/field.fits train 0.25 photometry 0.50")
+    assert text.endswith("b/field.fits train 2.67 photometry 0.17")
+
+
+def test_no_image_at_all_ends_in_one_line(tmp_path):
+    options = ["--fields", "", "--growth", "", "--results", str(tmp_path)]
+    run = CliRunner().invoke(image_costs.compare_tools, options)
+    assert run.exit_code == 2 and "no image: name one" in run.output
+
+
 @pytest.mark.parametrize("text", ["512", "512:x", "512:0", "8:10"])
 def test_sizes_that_are_none_are_refused(text):
     options = ["--fields", text, "--results", "r"]

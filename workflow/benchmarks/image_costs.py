@@ -136,15 +136,19 @@ def compare_tools(image, against, fields, growth, results):
 
     rows, failures, commit = [], 0, against or BEFORE
     # Images for all tools, then those for psfdae at this commit.
-    images, own_images = [*fields, *image], [size for size in growth if size not in fields]
+    images = [*dict.fromkeys([*fields, *image])]
+    own_images = [*dict.fromkeys(size for size in growth if size not in fields)]
+    if not images + own_images:
+        raise click.UsageError("no image: name one, or sizes with --fields or --growth")
     with TemporaryDirectory() as name:
         trees = {"psfdae": ROOT, f"psfdae {commit}": extract_commit(commit, Path(name, "earlier"))}
-        for number, source in enumerate(images + own_images):
+        named_images = zip(images + own_images, name_images(images + own_images), strict=True)
+        for number, (source, image_name) in enumerate(named_images):
             # Images of different folders may have the same name.
             folder = Path(name, f"image{number}")
             folder.mkdir()
             path = write_image(source, folder)
-            about = {"image": path.stem, "pixels": prod(fits.getdata(path).shape)}
+            about = {"image": image_name, "pixels": prod(fits.getdata(path).shape)}
             about["stars"] = None if isinstance(source, Path) else source[1]
             if number < len(images):
                 runs = chain(list_own_runs(path, trees, folder), list_peer_runs(path, folder))
@@ -156,7 +160,7 @@ def compare_tools(image, against, fields, growth, results):
                     row |= measure_process(words, folder, environment)
                 except click.ClickException as error:
                     failures += 1
-                    click.echo(f"{path.stem}, {tool}, {step} failed: {error.message}", err=True)
+                    click.echo(f"{image_name}, {tool}, {step} failed: {error.message}", err=True)
                 rows.append(row)
                 print(*row.values(), flush=True)
                 # Written after each run, so that an interruption loses none.
@@ -174,11 +178,30 @@ def compare_tools(image, against, fields, growth, results):
         raise click.ClickException(f"{failures} of {len(rows)} commands failed, see above")
 
 
+def name_images(sources):
+    """Return a name for each image: its file's, with folder and ending where two would be equal."""
+    names = [get_stem(source) for source in sources]
+    paths = {source: source.resolve() for source in sources if isinstance(source, Path)}
+    root = os.path.commonpath([path.parent for path in paths.values()]) if paths else None
+    return [
+        str(paths[source].relative_to(root)) if source in paths and names.count(name) > 1 else name
+        for source, name in zip(sources, names, strict=True)
+    ]
+
+
+def get_stem(source):
+    """Return the name of an image without its ending; it may have dots."""
+    if isinstance(source, Path):
+        return source.name.split(".fit")[0]
+    side, stars = source
+    return f"s{side}_{stars}"
+
+
 def write_image(source, folder):
     """Write a simulated field of (side, stars), or a copy of an image; return its path."""
+    path = folder / f"{get_stem(source)}.fits"
     if isinstance(source, Path):
         # SExtractor reads no compressed image.
-        path = folder / f"{source.name.split('.fit')[0]}.fits"
         content = source.read_bytes()
         path.write_bytes(gzip.decompress(content) if source.suffix == ".gz" else content)
         return path
@@ -187,7 +210,7 @@ def write_image(source, folder):
 
     # A quarter of the stars is bright enough for a model.
     side, stars = source
-    path, sizes = folder / f"s{side}_{stars}.fits", {"bright": stars // 4, "side_px": side}
+    sizes = {"bright": stars // 4, "side_px": side}
     recipe = replace(NightRecipe().field, faint=stars - stars // 4, saturated=0, **sizes)
     image = example_field(recipe, 1).image
     write_cube(path, image, GAIN=recipe.gain, SATURATE=float(recipe.saturation))

@@ -485,6 +485,6 @@ def fit_methods(
         fit = fit_method(stars, method_class, checkpoint)
         # The checkpoint goes when the fit is stored; until then, a killed run goes on from it.
         fits.store(fit, path, describe_settings(stars, method_class), stars.product)
-        checkpoint.unlink(missing_ok=True)
+        fits.delete_checkpoints(checkpoint)
         all_fits[method_class.name] = fit
     return all_fits

@@ -1,1 +1,1 @@
-"""An image and its stars: files, catalogues, detection, stamps, stars to learn from."""
+"""An image and its stars: files, catalogues, detection, stamps, training stars."""

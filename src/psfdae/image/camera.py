@@ -251,6 +251,15 @@ def check_camera(
             f"colour frame, {ONE_COLOUR}"
         )
         warn(remarks[-1:])
+    # One level is subtracted from all pixels before they become single precision, whose steps are
+    # up to 2⁻²³ of a value: an eighth of the noise here.
+    if sky.level_range > 2.0**20:
+        remarks.append(
+            f"{image.path}: the sky differs within the image by {sky.level_range:.1g} times its "
+            "noise, which single precision rounds: errors are wrong in parts of the image; "
+            "subtract the sky first, or mask these parts"
+        )
+        warn(remarks[-1:])
     if sky.correlation > 1.0:
         remarks.append(describe_shared_noise(image.path, sky.correlation))
     # A gain of the header that cannot be right is not used; a given one is.

@@ -6,6 +6,9 @@ Arnouts 1996, A&AS 117, 393); touching sources are parted where a saddle is deep
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import scipy
 
@@ -68,24 +71,21 @@ def _list_sources(sky: Sky, threshold: float, fwhm_px: float = 0.0) -> dict[str,
     smooth, limit = _smooth(sky, threshold, fwhm_px)
     # A source has at least a circle of half the FWHM in diameter.
     min_px = max(MIN_SOURCE_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
-    # Buffers of sep: pixels above the limit, and sources into which one may be parted.
-    bright_px = int(np.count_nonzero(smooth > limit))
-    sep.set_extract_pixstack(max(300_000, 2 * bright_px))
-    sep.set_sub_object_limit(max(1024, bright_px // min_px))
     # Sources are parted at saddles between 8 levels; 32 levels find 1 to 3 % more. Smoothed stars
     # have shallow saddles between them, which few levels miss.
-    sources, number = sep.extract(
-        np.ascontiguousarray(smooth, np.float32),
-        1.0,
-        err=np.ascontiguousarray(limit, np.float32),
-        mask=np.ascontiguousarray(sky.holes),
-        minarea=min_px,
-        filter_kernel=None,
-        deblend_nthresh=32 if fwhm_px else 8,
-        deblend_cont=0.005,
-        clean=False,
-        segmentation_map=True,
-    )
+    with enlarge_buffers(int(np.count_nonzero(smooth > limit)), min_px):
+        sources, number = sep.extract(
+            np.ascontiguousarray(smooth, np.float32),
+            1.0,
+            err=np.ascontiguousarray(limit, np.float32),
+            mask=np.ascontiguousarray(sky.holes),
+            minarea=min_px,
+            filter_kernel=None,
+            deblend_nthresh=32 if fwhm_px else 8,
+            deblend_cont=0.005,
+            clean=False,
+            segmentation_map=True,
+        )
     if not len(sources):
         return {"id": np.empty(0, np.int64)}
     # Centroids of the smoothed light, and the flux of each source's pixels.
@@ -108,6 +108,29 @@ def _list_sources(sky: Sky, threshold: float, fwhm_px: float = 0.0) -> dict[str,
         "FLUX_ISO": round_digits(flux),
         "BACKGROUND": round_digits(level),
     }
+
+
+@contextmanager
+def enlarge_buffers(bright_px: int, min_px: int) -> Iterator[None]:
+    """Enlarge the buffers of sep for an image; they are the user's, too, and restored at the end.
+
+    Parameters
+    ----------
+    bright_px : int
+        Pixels above the limit.
+    min_px : int
+        Pixels of the smallest source, of which one may have many.
+    """
+    import sep
+
+    stack_px, source_count = sep.get_extract_pixstack(), sep.get_sub_object_limit()
+    try:
+        sep.set_extract_pixstack(max(300_000, 2 * bright_px))
+        sep.set_sub_object_limit(max(1024, bright_px // min_px))
+        yield
+    finally:
+        sep.set_extract_pixstack(stack_px)
+        sep.set_sub_object_limit(source_count)
 
 
 def is_on_source(sky: Sky, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:

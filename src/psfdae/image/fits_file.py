@@ -268,7 +268,9 @@ class ImageFile:
     dtype : dtype
         Type of the values.
     unit_factor : float
-        Factor from the file's unit to the unit of the pixels that are read (`to_noise_unit`).
+        Factor from the file's unit to the unit of the pixels that are read (`to_single_precision`).
+    base_level : float
+        Level in the file's unit that is subtracted from these pixels.
     """
 
     file: PlainFile
@@ -283,6 +285,7 @@ class ImageFile:
     raw: Any = None
     dtype: type[np.floating] = np.float32
     unit_factor: float = 1.0
+    base_level: float = 0.0
 
     @property
     def path(self) -> Path:
@@ -330,23 +333,35 @@ class ImageFile:
         names = ("bscale", "bzero", "unit_factor")
         return replace(self, **{name: getattr(self, name) * factor for name in names})
 
-    def to_noise_unit(self) -> ImageFile:
-        """Return the image in a unit in which squares of its pixels fit into single precision.
+    def to_single_precision(self) -> ImageFile:
+        """Return the image with pixels whose noise and squares fit into single precision.
 
-        The unit is a power of 2⁴⁰, so that nothing is rounded and most images keep their own: the
-        median deviation of 32 rows, or stamps of a cube, is between 2⁻²⁰ and 2²⁰ then. Where most
-        pixels are the same, the largest deviation is.
+        A level of most pixels that is more than 2¹² times the noise is subtracted: with it, single
+        precision would round the noise. It is the value of a pixel, so that whole counts stay
+        whole. The unit is a power of 2⁴⁰, so that nothing is rounded and most images keep their
+        own: the median deviation of 32 rows, or stamps of a cube, is between 2⁻²⁰ and 2²⁰ then.
+        Where most pixels are the same, the largest deviation is.
         """
         # Rows, spread evenly over the image.
         rows = np.unique(np.linspace(0, self.shape[0] - 1, 32).astype(int))
         with open_pixels(self, in_pieces=True, dtype=np.float64) as pixels:
-            values = np.concatenate([pixels[row : row + 1].ravel() for row in rows])
-        values = values[np.isfinite(values)]
-        deviation = np.abs(values - np.median(values)) if values.size else np.zeros(1)
+            bands = np.concatenate([pixels[row : row + 1] for row in rows])
+        values = bands[np.isfinite(bands)]
+        if not values.size:
+            return self
+        level = float(np.quantile(values, 0.5, method="lower"))
+        deviation = np.abs(values - level)
         scatter = float(np.median(deviation)) or float(deviation.max())
         if not 0.0 < scatter < np.inf:
             return self
-        return self.times(2.0 ** (-40.0 * round(np.log2(scatter) / 40.0)))
+        # Neighbours in a row show the noise where the sky is not even: their difference has √2 σ.
+        with np.errstate(invalid="ignore"):
+            steps = np.abs(np.diff(bands, axis=-1))
+        noise = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else 0.0
+        image = self
+        if abs(level) > max(2.0**12 * (noise or scatter), 4.0 * scatter):
+            image = replace(self, bzero=self.bzero - level, base_level=level)
+        return image.times(2.0 ** (-40.0 * round(np.log2(scatter) / 40.0)))
 
     def one_plane(self) -> ImageFile:
         """Return the image without its first axis, which has length 1 (NAXIS3 = 1)."""

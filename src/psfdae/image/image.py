@@ -77,9 +77,10 @@ class Image(Observation):
     cache: PixelCache = field(default_factory=PixelCache)
 
     def camera_in_sky_unit(self) -> tuple[float | None, float]:
-        """Return gain and saturation for pixels in the unit of `sky`; inf without saturation."""
+        """Return gain and saturation for pixels as `sky` has them; inf without saturation."""
         gain = None if self.gain is None else self.gain / self.unit_factor
-        return gain, np.inf if self.saturate is None else self.saturate * self.unit_factor
+        saturate = np.inf if self.saturate is None else self.saturate
+        return gain, (saturate - self.data.base_level) * self.unit_factor
 
     # Bad pixels and sky of the whole image.
 
@@ -106,9 +107,9 @@ class Image(Observation):
         if self.cache.bad_pixels is None:
             try:
                 with silent():
-                    # In the unit of the file, which messages have.
-                    unit, headers = self.unit_factor, self.data.headers
-                    bad_pixels = find_bad_pixels(image / unit, is_masked, headers, self.saturate)
+                    # As in the file, which messages name.
+                    pixels, headers = self.to_image_unit(image), self.data.headers
+                    bad_pixels = find_bad_pixels(pixels, is_masked, headers, self.saturate)
                     saturate = self.camera_in_sky_unit()[1]
                     self.cache.bad_pixels = add_trails(image, bad_pixels, saturate)
             except ClippedSkyError as error:
@@ -117,6 +118,8 @@ class Image(Observation):
 
     def sky(self) -> Sky:
         """Return the sky and the image without it, in the unit of the image times `unit_factor`.
+
+        Its level is above the `base_level` of `data`.
 
         Raises
         ------
@@ -227,6 +230,7 @@ class Image(Observation):
         window = (self.shape, x, y, stamp_px, margin)
         data, inside, is_truncated = cut_image(pixels, *window)
         data = self.to_image_unit(data)
+        data[~inside] = 0.0
         # Other stars of a crowded image are subtracted.
         raw = data
         if self.neighbour_light is not None:

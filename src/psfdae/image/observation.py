@@ -181,11 +181,13 @@ class Observation(ABC):
         return self.data.unit_factor
 
     def to_image_unit(self, values: np.ndarray) -> np.ndarray:
-        """Return values that are in the unit of the sky in the unit of the image.
+        """Return pixels that are in the unit of the sky, and without `base_level`, as in the image.
 
-        They become double precision if these units differ.
+        They become double precision unless both are the same.
         """
-        return values if self.unit_factor == 1.0 else values / np.float64(self.unit_factor)
+        if (self.unit_factor, self.data.base_level) == (1.0, 0.0):
+            return values
+        return values / np.float64(self.unit_factor) + self.data.base_level
 
     @property
     def wcs(self) -> WCS | None:

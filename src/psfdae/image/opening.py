@@ -82,8 +82,9 @@ def open_observation(source: ImageInput, stamp_px: int, margin: int = 0) -> Imag
     if not is_cube:
         camera, camera_remarks, noise_correlation = check_camera(data, camera)
         remarks += [*camera_remarks, *sky_coordinate_remarks(data)]
-    # Pixels are read in a unit in which no square overflows; stamps and tables have the image's.
-    data = data.to_noise_unit()
+    # Pixels are read in a unit in which no square overflows, and at a level at which no noise is
+    # rounded; stamps and tables have the image's own.
+    data = data.to_single_precision()
     mask, noise_map, layer_remarks = find_layers(source, data, is_cube)
     # The noise of the electronics in counts: read noise / gain.
     gain, read_noise = camera["gain"].value, camera["read noise"].value
@@ -253,8 +254,9 @@ def detect_stars(image: Image, sky: Sky, threshold: float) -> Catalogue:
     with silent():
         # The list has the columns of SExtractor, as a list in a file might.
         table = Table(find_sources(sky, threshold))
-        for name in {"FLUX_ISO", "BACKGROUND"}.intersection(table.colnames):
-            table[name] /= image.unit_factor
+        if len(table):
+            table["FLUX_ISO"] /= image.unit_factor
+            table["BACKGROUND"] = image.to_image_unit(table["BACKGROUND"])
     if len(table) == 0:
         raise ObservationError(
             image.path,

@@ -143,6 +143,8 @@ class SkySample:
     checker : float
         Mean of the pixels whose row and column are both even or both odd, minus the mean of the
         others, in units of the noise: the contrast of a chessboard.
+    level_range : float
+        Deviation of the squares' medians from `level` in units of their noise, which 5 % exceed.
     """
 
     level: float
@@ -150,6 +152,7 @@ class SkySample:
     highest: float
     correlation: float
     checker: float
+    level_range: float
 
 
 def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
@@ -209,8 +212,9 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     # are enough, of which a correlation has the error 0.003.
     middle = tuple(slice(max(0, size // 2 - 256), size // 2 + 256) for size in bands.shape)
     correlation = noise_correlation(bands[middle])
-    noise = correlation * float(np.median(noises))
-    return SkySample(float(np.median(levels)), noise, highest, correlation, checker)
+    level, noise = float(np.median(levels)), correlation * float(np.median(noises))
+    level_range = float(np.percentile(np.abs(np.subtract(levels, level)) / noises, 95))
+    return SkySample(level, noise, highest, correlation, checker, level_range)
 
 
 # Stamps: the sky in their border, and around them.

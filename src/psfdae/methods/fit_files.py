@@ -7,6 +7,7 @@ of a method, whose `Storage` lists the files of a fit.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,16 @@ def store(fit: Method, path: Path, config: Mapping[str, Any], stars: Product) ->
     write_origin(path, stars)
     for name in get_storage(type(fit)).diagnostics:
         write_text(path_beside(type(fit), path, name), as_csv(fit.diagnostic_rows[name]))
+
+
+def delete_checkpoints(checkpoint: Path) -> None:
+    """Delete the checkpoint of a fit that is written, and of its further trainings.
+
+    These have names such as fit.NAME.pt beside fit.pt.
+    """
+    further_checkpoints = checkpoint.parent.glob(f"{escape(checkpoint.stem)}.*.pt")
+    for path in (checkpoint, *further_checkpoints):
+        path.unlink(missing_ok=True)
 
 
 def describe_fit(

@@ -60,7 +60,7 @@ class CrowdedPhotometry:
         Wings in the fluxes: of the image, or of the model if no star is bright enough to show
         any.
     image_wings : Wings or None
-        Wings of the image, which faint stars hardly show; None without a star that has light.
+        Wings of the image, which faint stars hardly show; the model's if no star fits its PSF.
     chi2_ratio : float
         Median of the χ² of bright stars divided by the χ² that training stars of their S/N would
         have; NaN if not known.

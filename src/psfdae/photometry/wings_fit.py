@@ -373,6 +373,7 @@ def around_stars(
     wing_light : ndarray, shape (h, w)
         With the halos of saturated cores.
     wings : Wings or None
+        The earlier ones if no star fits its model.
     halo_error : ndarray, shape (h, w)
         Standard error of these halos in a pixel, which neighbours share.
     """
@@ -394,9 +395,11 @@ def around_stars(
             # The wings of stars unlike the PSF are subtracted, but not fitted.
             is_like = is_like_psf(residual, bad, sigma, stars.position)
             fitted_stars = stars._replace(flux=np.where(is_like, stars.flux, np.nan))
-        previous, wings = wings, fit_wings(residual, sigma, bad, fitted_stars, stamp_px, wings)
-        if wings is None:
+        previous, fit = wings, fit_wings(residual, sigma, bad, fitted_stars, stamp_px, wings)
+        # Without a star that fits, the wings stay the earlier ones, without which the sky is.
+        if fit is None:
             break
+        wings = fit
         # Until their light changes by less than the given fraction of its error.
         light, light_sigma = wings.light()
         if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:

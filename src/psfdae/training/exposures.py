@@ -177,7 +177,7 @@ def adapt_to_stars(model: Model, stars: ImageStars) -> Model:
     model, train = model.to_image_frame(stars.observation)[0], stars.split.train
     bright = stars.candidates.bright.select(np.flatnonzero(~stars.held_out))
     adapted_model = _adapt(model, stars.observation, bright, stars.name)
-    # The checksum of the stars that were learnt from shows a test that it saw no other.
+    # The checksum of the training stars shows a test that no other stars were used.
     training_sha256 = checksum(
         stars.product["realisation"][train], stars.product[stars.reference][train]
     )

@@ -144,7 +144,7 @@ def choose_method(stars: ImageStars, fits: Mapping[str, Method]) -> tuple[str, d
         judged_fit, kind = method_fit, type(method_fit)
         data = stars.training_set(kind)
         with fix_threads(kind.threads(settings)):
-            # A method without a need of validation stars has learnt from them as well: what is
+            # A method without a need of validation stars was trained on them as well: what is
             # judged is a fit without them. One that needs them, to stop, has not.
             if not kind.needs.validation:
                 judged_fit = fit_apart(kind, data, product["field_index"], settings)

@@ -317,7 +317,7 @@ def metrics_by_level(
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:
-    """Return the SHA-256 of training stars and of what was to be learnt from them.
+    """Return the SHA-256 of training stars and of the reference images of these.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ class ImageStars:
     candidates : Candidates
         Measurements of each star of the list, and the bright stars among them.
     held_out : ndarray of bool, shape (n,)
-        True for bright stars that no fit learns from.
+        True for bright stars that are not used in any fit.
     settings : Settings
         Settings, with the noise levels that follow from the stars.
     notes : sequence of str
@@ -61,7 +61,7 @@ class ImageStars:
     --------
     >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
     >>> stars
-    Stars('array', 36 stars (29 to learn from, 7 held out) of 36)
+    Stars('array', 36 stars (29 training stars, 7 held out) of 36)
     >>> [str(part) for part in stars.table["part"][:2]]
     ['training', 'held out']
     """
@@ -116,7 +116,7 @@ class ImageStars:
     def _counts(self) -> str:
         """Words for the numbers of stars of the training and of the test."""
         held_out = int(self.held_out.sum())
-        return f"{len(self) - held_out} to learn from, {held_out} held out"
+        return f"{len(self) - held_out} training stars, {held_out} held out"
 
     def __repr__(self) -> str:
         path, count = str(self.observation.path), len(self.candidates.verdict)

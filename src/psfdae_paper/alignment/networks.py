@@ -220,11 +220,10 @@ def predict_states(
         ]
         return np.asarray(np.mean(estimates, axis=0))
     # Batches bound the memory.
-    parts = [
-        model(scale_stamps(stamps[start : start + batch])).numpy()
-        for start in range(0, len(stamps), batch)
-    ]
-    return np.concatenate(parts).astype(np.float64)
+    states = np.empty((len(stamps), 4))
+    for part in (slice(start, start + batch) for start in range(0, len(stamps), batch)):
+        states[part] = model(scale_stamps(stamps[part])).numpy()
+    return states
 
 
 @dataclass(frozen=True)

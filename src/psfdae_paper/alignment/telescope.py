@@ -24,6 +24,7 @@ import numpy as np
 
 from psfdae.base.errors import Error
 from psfdae.optics.wavefronts import FIRST_NOLL
+from psfdae.sensing.quadratic import quadratic_terms
 from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import RayTracingError, ZernikeTracer, build_optic
 from psfdae.telescope.settings import Telescope
@@ -166,12 +167,6 @@ def mirror_symmetries(points: int) -> list[Mirror]:
             state_matrix[2:, 2:] = np.round(np.linalg.det(matrix)) * matrix
             mirrors.append(Mirror(symmetry, state_matrix, distance.argmin(axis=1)))
     return mirrors
-
-
-def quadratic_terms(states: np.ndarray) -> np.ndarray:
-    """Return 1, the four numbers of states (n, 4) and their ten products, shape (n, 15)."""
-    products = [states[:, a] * states[:, b] for a, b in PAIRS]
-    return np.column_stack([np.ones(len(states)), states, *products])
 
 
 @dataclass(frozen=True)

@@ -108,12 +108,12 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         training = cls.train(data, posterior_network)
         network, history = training.finish(), training.history
-        # The second training has a checkpoint beside the one of the first.
+        # The second training has a checkpoint beside the one of the first; the caller removes both
+        # after writing the fit.
         begin = partial(WavefrontTraining, data, training.config, posterior_network, network)
         assert data.checkpoint is not None
         checkpoint = data.checkpoint.with_suffix(".wavefront.pt")
         proposer_training = cls.run(begin, data, posterior_network, checkpoint)
-        checkpoint.unlink(missing_ok=True)
         # Its epochs and times follow the first training.
         latest = {key: history[-1][key] for key in ("epoch", "step", "seconds", "cpu_seconds")}
         for row in proposer_training.history:

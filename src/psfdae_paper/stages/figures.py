@@ -6,6 +6,7 @@ functions of `psfdae_paper.evaluation`, which take arrays and tables only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -36,6 +37,12 @@ Png = Annotated[File, "PNG."]
 DatasetName = Annotated[str, "Name in the tables."]
 Bounds = Annotated[File, "CSV of the stage bounds."]
 Efficiency = Annotated[File, "CSV of the stage efficiency."]
+
+ROW_KEYS = ("dataset", "reference", "method", "noise_level")
+BOUND_COLUMNS = (*ROW_KEYS, "metric", "value", "stderr", "n", "ci_low", "ci_high", "tight")
+EFFICIENCY_COLUMNS = (*ROW_KEYS, "bound", "mse", "stderr", "efficiency", "n")
+GROWTH_COLUMNS = (*ROW_KEYS, "draws", "mse", "stderr", "limit", "n")
+"""Columns of tables that figures draw."""
 
 
 @command("paper figure templates")
@@ -140,7 +147,8 @@ def figure_headline(
     ]
     rows.append(StripRow("truth", truth[five]))
     # Errors of methods and bounds of the same dataset.
-    errors, limits = (read_rows(path, dataset, "realisation") for path in (efficiency, bounds))
+    errors = read_rows(efficiency, EFFICIENCY_COLUMNS, dataset, "realisation")
+    limits = read_rows(bounds, BOUND_COLUMNS, dataset, "realisation")
     limits = limits[limits.metric == "mse"]
     count = limits["n"].max()
     titles = (f"Test stars of {dataset}, λ = {level:g}", f"Error against noise, {count} test stars")
@@ -251,14 +259,16 @@ def figure_errors(
 @command("paper figure bounds")
 def figure_bounds(dataset: DatasetName, bounds: Bounds, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' errors above the bounds, against the noise level."""
-    tables = (read_rows(efficiency, dataset), read_rows(bounds, dataset))
-    write_png(bound_figures.draw_bounds(*tables, dataset), out)
+    errors = read_rows(efficiency, EFFICIENCY_COLUMNS, dataset)
+    limits = read_rows(bounds, BOUND_COLUMNS, dataset)
+    write_png(bound_figures.draw_bounds(errors, limits, dataset), out)
 
 
 @command("paper figure efficiency")
 def figure_efficiency(dataset: DatasetName, efficiency: Efficiency, out: Png) -> None:
     """Draw the methods' efficiency against the noise level."""
-    write_png(bound_figures.draw_efficiency(read_rows(efficiency, dataset), dataset), out)
+    rows = read_rows(efficiency, EFFICIENCY_COLUMNS, dataset)
+    write_png(bound_figures.draw_efficiency(rows, dataset), out)
 
 
 @command("paper figure bank-growth")
@@ -274,16 +284,21 @@ def figure_bank_growth(dataset: DatasetName, growth: File, out: Png) -> None:
     out : Path
         PNG.
     """
-    write_png(bound_figures.draw_bank_growth(read_rows(growth, dataset), dataset), out)
+    rows = read_rows(growth, GROWTH_COLUMNS, dataset)
+    write_png(bound_figures.draw_bank_growth(rows, dataset), out)
 
 
-def read_rows(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
+def read_rows(
+    path: Path, columns: Sequence[str], dataset: str, reference: str | None = None
+) -> pd.DataFrame:
     """Read the rows of a dataset, and of a reference if one is given.
 
     Parameters
     ----------
     path : Path
-        CSV with the column dataset.
+        CSV.
+    columns : sequence of str
+        Columns that it must have.
     dataset : str
         Name in the table.
     reference : str, optional
@@ -297,9 +312,9 @@ def read_rows(path: Path, dataset: str, reference: str | None = None) -> pd.Data
     Raises
     ------
     ProductError
-        If the table lacks such rows.
+        If the table lacks such rows, or a column.
     """
-    table = read_table(path)
+    table = read_table(path, *columns)
     rows = table[table.dataset == dataset]
     if reference is not None:
         rows = rows[rows.reference == reference]

@@ -97,4 +97,4 @@ def fit(
     # The same call as for an astronomer's own stars.
     estimator = method_class.fit(data, **method_class.settings(config))
     fits.store(estimator, out, fit_config, product)
-    checkpoint_path.unlink(missing_ok=True)
+    fits.delete_checkpoints(checkpoint_path)

@@ -18,6 +18,7 @@ import click
 from psfdae.base.files import write_text
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_json
+from psfdae.methods.fit_files import delete_checkpoints
 from psfdae.methods.interface import FitError
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import part
@@ -180,7 +181,7 @@ def _train(measure: Callable[[], Measurement], config: Config, task: Task) -> di
         # A training that cannot continue is a result without metrics.
         status, reason = "failed", str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
-        task.checkpoint.unlink(missing_ok=True)
+        delete_checkpoints(task.checkpoint)
         seconds, cpu_seconds = time.monotonic() - start_s, time.process_time() - start_cpu_s
         measurement = Measurement({}, config.model_dump(), seconds, cpu_seconds, attempt=None)
     # The cost differs from run to run and has a file of its own; times are to a millisecond.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sep
 from astropy.io import fits
 from astropy.table import Table
 from photutils.segmentation import SourceCatalog, SourceFinder
@@ -95,6 +96,37 @@ def test_a_source_may_have_any_number_of_pixels_and_peaks():
     stars = find_sources(sky, 5.0)
     assert stars["FLUX_ISO"] == pytest.approx([light.sum()], rel=1e-6)
     assert stars["X_IMAGE"] == pytest.approx([300.5], abs=3.0)
+
+
+def test_buffers_of_sep_stay_those_of_the_user(monkeypatch):
+    """They are global, and a detection may end in an error."""
+    rng, shape = np.random.default_rng(1), (64, 64)
+    sky = Sky(rng.normal(0, 1, shape), np.zeros(shape), np.ones(shape), np.zeros(shape) > 1, np.nan)
+    extract, seen = sep.extract, []
+
+    def look(*arguments, **options):
+        seen.append((sep.get_extract_pixstack(), sep.get_sub_object_limit()))
+        return extract(*arguments, **options)
+
+    def fail(*arguments, **options):
+        look(*arguments, **options)
+        raise RuntimeError("internal pixel buffer full")
+
+    before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
+    try:
+        sep.set_extract_pixstack(1000)
+        sep.set_sub_object_limit(7)
+        monkeypatch.setattr(sep, "extract", look)
+        find_sources(sky, 3.0)
+        assert (sep.get_extract_pixstack(), sep.get_sub_object_limit()) == (1000, 7)
+        monkeypatch.setattr(sep, "extract", fail)
+        with pytest.raises(RuntimeError, match="buffer"):
+            find_sources(sky, 3.0)
+        assert (sep.get_extract_pixstack(), sep.get_sub_object_limit()) == (1000, 7)
+        assert seen == [(300_000, 1024)] * 2
+    finally:
+        sep.set_extract_pixstack(before[0])
+        sep.set_sub_object_limit(before[1])
 
 
 def test_stars_are_found_where_they_are(field):

@@ -18,7 +18,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.interpolation import fill_bad, fill_bad_stamps
 from psfdae.image.opening import open_observation
 from psfdae.image.selection import Verdict, fill_bad_pixels
-from psfdae.image.sky import subtract_sky
+from psfdae.image.sky import sky_around, subtract_sky
 from psfdae.image.sky_level import (
     SkyStructure,
     _smooth_meshes,
@@ -631,19 +631,26 @@ def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
     bad_pixels.refuse_clipped_sky(photons, np.zeros(photons.shape, bool))
 
 
-# Units.
+# Units and levels.
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("unit", "tolerance"),
-    [(2.0**-80, 0.0), (2.0**100, 0.0), (1e-30, FitOptions.tolerance), (1e30, FitOptions.tolerance)],
+    ("unit", "level", "tolerance"),
+    [
+        (2.0**-80, 0.0, 0.0),
+        (2.0**100, 0.0, 0.0),
+        (1e-30, 0.0, FitOptions.tolerance),
+        (1e30, 0.0, FitOptions.tolerance),
+        (1.0, 1e8, FitOptions.tolerance),
+        (1e-30, -1e-20, FitOptions.tolerance),
+    ],
 )
-def test_nothing_depends_on_the_unit(clean, unit, tolerance):
+def test_nothing_depends_on_the_unit_or_the_level(clean, unit, level, tolerance):
     """Other units than powers of 2 round pixels, which may end a fit sooner, at its tolerance."""
     image = clean[0] - SKY
     results = []
-    for pixels in (image, image * unit):
+    for pixels in (image, image * unit + level):
         stars = Stars.from_image(pixels, detect=True)
         model = fit_isolated_stars(stars)
         results.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
@@ -658,6 +665,79 @@ def test_nothing_depends_on_the_unit(clean, unit, tolerance):
     off = np.abs(np.array(scaled["flux"]) / unit - flux)
     limits = 0.01 * np.array(table["flux_error"]) + tolerance * np.abs(flux)
     assert np.nanmax(off / limits) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("form", "level"),
+    [
+        ("array", 1e5),
+        ("array", -1e8),
+        ("float file", 2e9),
+        ("whole counts", 1e12),
+        ("scaled", 1e8),
+        ("cube", 1e8),
+    ],
+)
+def test_no_level_rounds_the_noise(clean, tmp_path, form, level):
+    """Single precision has steps of 8 at 1e8, and of 65,536 at 1e12: σ came out too large."""
+    counts, place = np.rint(clean[0]), clean[1]
+    counts[:, :3] = -40.0  # blank columns
+    camera = {"gain": 1.5, "read_noise": 5.0, "pixel_scale_arcsec": 0.6}
+    results = []
+    for offset in (0.0, level):
+        image, path = counts + offset, tmp_path / f"{offset:g}.fits"
+        # A saturation is above 0.
+        options = camera | ({"saturate": 4000.0 + offset} if level > 0 else {})
+        if form == "cube":
+            corner = np.rint(place).astype(int) - 12
+            stamps = [image[y : y + 24, x : x + 24] for x, y in corner if min(x, y) >= 0]
+            image, options["catalogue"] = np.stack([s for s in stamps if s.size == 576]), None
+        elif form == "scaled":
+            # Half of a count in 16 bits, above BZERO.
+            hdu = fits.PrimaryHDU(np.rint(2.0 * np.clip(counts, -40, 16000) - 3e4).astype("i2"))
+            hdu.header["BSCALE"], hdu.header["BZERO"] = 0.5, 1.5e4 + offset
+            hdu.writeto(path)
+        elif form != "array":
+            fits.writeto(path, image.astype("i8" if form == "whole counts" else "f8"))
+        if form != "cube":
+            options["detect"] = True
+        opened = open_observation(
+            ImageInput(path if path.exists() else image, **options), 16, margin=4
+        )
+        (stars,) = opened.chunks(500)
+        if form == "cube":
+            noise = sky_around(stars.data, stars.bad, 16)
+            results.append((opened, stars, noise[0] - offset, noise[1]))
+            continue
+        background = np.array(opened.detections.table["BACKGROUND"])
+        sky = opened.sky()
+        assert "960 blank pixels (value" in opened.describe_bad_pixels()[0]
+        assert f"{offset - 40:g}" in opened.describe_bad_pixels()[0]
+        results.append((opened, stars, background - offset, sky.noise, sky.signal, stars.noise))
+    (first, first_stars, *expected), (second, second_stars, *values) = results
+    # As exactly as single precision has it without the level, and double precision with it.
+    limit = 1e-2 + 4.0 * np.spacing(abs(level))  # σ is 14
+    assert first.count == second.count > 50
+    for known, value in zip(expected, values, strict=True):
+        assert value == pytest.approx(known, rel=1e-5, abs=limit)
+    inside = ~first_stars.bad
+    assert (inside == ~second_stars.bad).all() and inside.mean() > 0.9
+    assert (second_stars.data - level)[inside] == pytest.approx(first_stars.data[inside], abs=limit)
+    assert (first_stars.saturated == second_stars.saturated).all()
+    assert first_stars.saturated.any() == (level > 0)
+    assert not any("single precision" in remark for remark in second.remarks)
+
+
+def test_a_sky_that_no_level_brings_to_single_precision_is_said(clean):
+    """Half of the image is 1e9 above the other; an unexposed area of one value is left out."""
+    image, half = np.array(clean[0]), np.s_[:, : SIDE // 2]
+    image[half] += 1e9
+    with pytest.warns(UserWarning, match="which single precision rounds"):
+        opened = open_observation(ImageInput(image, catalogue=clean[1], origin=0), 16)
+    assert "times its noise, which single precision rounds" in opened.summary()
+    image[half] = 1e9
+    opened = open_observation(ImageInput(image, catalogue=clean[1], origin=0), 16)
+    assert "single precision" not in opened.summary()
 
 
 # Pixels far below the sky.

@@ -372,7 +372,7 @@ def test_the_position_is_used_where_it_tells_something():
         for m in (with_place, unplaced)
     ]
     assert errors[0] < 0.9 * errors[1]
-    # Learnt on one half of the field, it is wrong on the other.
+    # Trained on one half of the field, it is wrong on the other.
     misled = data.positions.copy()
     misled[data.validation] = misled[data.validation[::-1]] * [-1.0, 3.0]
     misfit = PlacedGmm.fit(replace(data, positions=misled), settings)

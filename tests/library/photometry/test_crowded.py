@@ -482,6 +482,26 @@ def test_read_noise_limits_the_noise_of_the_sky_in_all_fits():
     assert sky.noise.min() == again.noise.min() == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("earlier", [None, "wings"])
+def test_wings_that_no_star_of_an_image_shows_stay_the_earlier_ones(earlier):
+    """Their light was left in the image, which had its sky without it."""
+    rng, place = np.random.default_rng(4), np.array([[64.0, 64.0], [30.0, 90.0]])
+    wings = earlier and Wings(RADIUS, np.geomspace(3e-4, 1e-4, 7), 1e-9 * np.eye(7), 0.03)
+    stars = StarFluxes(place, np.array([3e5, 2e5]), np.full(2, 0.03))
+    light, nothing = draw_wings((128, 128), stars, wings), np.zeros((128, 128))
+    image = 50.0 + light + rng.normal(0.0, 3.0, light.shape)
+    # Galaxies: their middle is far above the models, and above nothing.
+    for x, y in place.astype(int):
+        image[y - 2 : y + 3, x - 2 : x + 3] += 3e3
+    none = nothing > 0
+    sky, error = subtract_sky(image, none), np.full(light.shape, 3.0)
+    args = image, sky, error, nothing, stars, 10, wings, 0.1, np.empty((0, 3))
+    sky, wing_light, wings_after, _ = around_stars(*args)
+    assert wings_after is wings
+    assert wing_light == pytest.approx(light)
+    assert np.median(sky.level) == pytest.approx(50.0, abs=0.3)
+
+
 @pytest.mark.parametrize("distance", [9, 60])
 def test_wings_of_a_star_on_saturated_cores_without_halos_are_subtracted_once(distance):
     """Nothing is left of them, and they are in the map of the light, for one core or two."""

@@ -194,6 +194,22 @@ def test_components_are_those_of_mirrored_noisy_stamps(scene3, noise, stamps, st
     assert spread == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
+def test_any_number_of_states_is_estimated(count):
+    """The estimate of no state at all ended in an error of numpy."""
+    stamps = np.random.default_rng(3).random((count, 9, 4, 4)).astype(np.float32)
+
+    class FirstPixels(nn.Module):
+        def forward(self, images):
+            return images[:, 0, 0]
+
+    first = predict_states(FirstPixels(), stamps, batch=2)
+    assert first.dtype == np.float64 and first.shape == (count, 4)
+    assert first == pytest.approx(16.0 * stamps[:, 0, 0])
+    mirrored = predict_states(FirstPixels(), stamps, batch=2, mirrors=mirror_symmetries(8))
+    assert mirrored.shape == (count, 4)
+
+
 # --- Fisher information and maximum likelihood
 
 

@@ -258,6 +258,32 @@ def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
         figures.figure_bank_growth("dataset1", scene_1 / "growth.csv", tmp_path / "h.png")
 
 
+@pytest.mark.parametrize("table", ["bounds", "efficiency", "growth"])
+def test_a_table_of_an_earlier_version_is_named_with_the_column_that_it_lacks(table, tmp_path):
+    """Tables of the growth of a bank had no stderr and no n."""
+    columns = {
+        "bounds": figures.BOUND_COLUMNS,
+        "efficiency": figures.EFFICIENCY_COLUMNS,
+        "growth": figures.GROWTH_COLUMNS,
+    }
+    paths = {name: tmp_path / f"{name}.csv" for name in columns}
+    for name, path in paths.items():
+        row = [["dataset6"] * len(columns[name])]
+        pd.DataFrame(row, columns=columns[name]).to_csv(path, index=False)
+    complete = pd.read_csv(paths[table])
+    for column in columns[table]:
+        complete.drop(columns=column).to_csv(paths[table], index=False)
+        with pytest.raises(ProductError, match=f"{table}.csv: column '{column}' is missing"):
+            if table == "growth":
+                figures.figure_bank_growth("dataset6", paths["growth"], tmp_path / "g.png")
+            else:
+                both = paths["bounds"], paths["efficiency"]
+                figures.figure_bounds("dataset6", *both, tmp_path / "b.png")
+    if table == "efficiency":
+        with pytest.raises(ProductError, match="column 'n' is missing"):
+            figures.figure_efficiency("dataset6", paths[table], tmp_path / "e.png")
+
+
 @pytest.mark.parametrize(
     ("bound", "tight", "verdict"),
     [

@@ -16,6 +16,7 @@ from psfdae.base.settings import ConfigError, parse_settings
 from psfdae.denoise.bundle import read_bundle, write_bundle
 from psfdae.denoise.star_model import StarModel
 from psfdae.methods import method
+from psfdae.methods.fit_files import delete_checkpoints
 from psfdae.methods.interface import FitError
 from psfdae.methods.networks.training import Training
 from psfdae.optics.derivatives import PointSampling, SampledStamps
@@ -33,6 +34,7 @@ from psfdae_paper.bounds.posterior_network import (
     list_representations,
     measure_statistics,
 )
+from psfdae_paper.bounds.refinement import Combination
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.configuration.posterior_network import PosteriorNetworkSettings
@@ -309,6 +311,33 @@ def test_refined_network_is_saved_with_its_optics(product, tmp_path):
         kind.fit(replace(data, simulation=turbulence), **kind.settings(config))
     with pytest.raises(ConfigError, match="posterior_network_refined"):
         load(["dataset=dataset3", "noise.law=gaussian", f"methods=[{kind.name}]"])
+
+
+def test_a_fit_killed_before_its_combination_keeps_both_trainings(product, tmp_path, monkeypatch):
+    """The second one lost its checkpoint before the combination was fitted and written."""
+    kind, checkpoint = method("posterior_network_refined"), tmp_path / "fit.pt"
+    words = (*WORDS, "noise.levels=[0.0003,0.001]", "posterior_network.stars=40")
+    words += ("posterior_network.epochs=2", "posterior_network.steps=2")
+    words += ("posterior_network.checkpoint_seconds=0",)
+    config = load_stage(("seed", "noise", "parts", "posterior_network"), words)
+    data = training_set(config, kind, product, "random", "realisation", checkpoint=checkpoint)
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Combination, "fit", kill)
+        kind.fit(data, **kind.settings(config))
+    assert {path.name for path in tmp_path.iterdir()} == {"fit.pt", "fit.wavefront.pt"}
+    # No epoch is run again.
+    monkeypatch.setattr(Training, "run_epoch", kill)
+    resumed = kind.fit(data, **kind.settings(config))
+    assert len(resumed.diagnostic_rows["history.csv"]) == 4
+    # The stage deletes the checkpoints of this fit, and no others, once the fit is written.
+    (tmp_path / "fit-template.pt").touch()
+    (tmp_path / "fit2.wavefront.pt").touch()
+    delete_checkpoints(checkpoint)
+    assert {path.name for path in tmp_path.iterdir()} == {"fit-template.pt", "fit2.wavefront.pt"}
 
 
 @pytest.mark.parametrize("law", [GaussianNoise, partial(CorrelatedNoise, shift_px=0.5)])

@@ -95,7 +95,7 @@ class FieldMixture(FieldPrior, Method):
         """
         if data.bright is None:
             raise FitError(
-                "it learns from the bright stars of an image: "
+                "it is trained on the bright stars of an image: "
                 + call("psfdae.Stars.from_image", "psfdae train")
             )
         # The field is fitted in frames with a margin, so that residuals can be shifted by 2 px.
