@@ -21,6 +21,7 @@ import scipy
 from psfdae.image.interpolation import fill_bad
 from psfdae.stars.moments import (
     count_step,
+    cubic_splines,
     dither,
     remove_dither,
     robust_scatter,
@@ -459,18 +460,17 @@ def _to_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     slope : float
         Part of the slope outside the outer meshes, as in `_extrapolate`.
     """
-    from scipy.interpolate import BSpline
+    from scipy.sparse import csr_array
 
     # Coefficients of the spline through the meshes, which ends 14 meshes outside the image.
     margin = 14
     extended_mesh = np.pad(_extrapolate(mesh, 2, slope), margin - 2, mode="edge")
     coefficients = scipy.ndimage.spline_filter(extended_mesh, mode="mirror")
-    # Weights of the coefficients along rows and columns: four at each pixel.
+    # Weights of the coefficients along rows and columns: four at each pixel. Positions are in
+    # meshes from the middle one.
     row_weights, column_weights = (
-        BSpline.design_matrix(
-            (np.arange(pixels) + 0.5) / mesh_px - 0.5 + margin, np.arange(-2.0, count + 2.0), 3
-        )
-        for pixels, count in zip(shape, coefficients.shape, strict=True)
+        csr_array(cubic_splines((np.arange(pixels) + 0.5) / mesh_px - 0.5 * count, knots, 1.0))
+        for pixels, count, knots in zip(shape, mesh.shape, coefficients.shape, strict=True)
     )
     # A few rows at a time: products take twice the memory of the values.
     columns = np.ascontiguousarray((column_weights @ coefficients.T).T)
