@@ -326,7 +326,7 @@ def test_squares_of_one_value_have_8_px(rows, is_found):
 
 
 @pytest.mark.parametrize("shift", range(8))
-def test_squares_of_one_value_are_found_anywhere(shift):
+def test_constant_squares_are_found_anywhere(shift):
     """Inside, and across an edge, beyond which the image repeats its last pixels."""
     values = np.random.default_rng(3).normal(size=(50, 60))
     for area in (
