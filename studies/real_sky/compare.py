@@ -102,7 +102,7 @@ def main(out, *folders):
     print("|---|---" + 2 * len(CENTRES) * "|---" + "|")
     peers = table[table.package != "psfdae"]
     for (image, snr), cell in peers.groupby(["image", "snr"], sort=False):
-        lowest = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").loc[[*CENTRES]]
+        lowest = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").reindex(CENTRES)
         cells = [
             f"{best_cell[name]:.2f} ± {best_cell[error]:.2f}"
             for name, error in (("ratio", "ratio_stderr"), ("median_ratio", "median_stderr"))

@@ -200,6 +200,12 @@ def find_constant_squares(values: np.ndarray, side: int = 8) -> np.ndarray:
     side : int
         Side of the squares in px.
     """
+    # Each square, also one across an edge, has one of every `side` rows: most images have none in
+    # which so many neighbours are the same.
+    rows = np.pad(values, side // 2, mode="edge")[::side]
+    is_same = np.lib.stride_tricks.sliding_window_view(rows[:, 1:] == rows[:, :-1], side - 1, 1)
+    if not is_same.all(axis=2).any():
+        return np.zeros(values.shape, dtype=bool)
     # Filters would spread NaN in an order of their own.
     is_finite = np.isfinite(values)
     low = scipy.ndimage.minimum_filter(np.where(is_finite, values, -np.inf), side, mode="nearest")
@@ -475,23 +481,23 @@ def find_cosmic_rays_in_band(
     # where pixels of the windows about a pixel changed.
     is_changed: np.ndarray | bool = True
     for _ in range(8):
-        # L⁺ of all pixels; half of the limit on a cosmic ray picks out those that are worth a
-        # closer look.
-        edge = compute_edges(clean)
-        row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden & ~cosmic & is_changed)
-        if not row.size:
-            break
-        sigma = _measure_noise(clean, noise, row, column)
-        height, structure = _measure_contrast(clean, edge, row, column)
-        # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
-        limit = np.maximum(6.0 * sigma, ratio * (np.maximum(structure, 0.0) + sigma))
-        sharp = height > limit
-        new = np.zeros_like(cosmic)
-        new[row[sharp], column[sharp]] = True
-        # Next to a cosmic ray, half the height is enough for both.
-        is_beside = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))[row, column]
-        is_beside &= height > 0.5 * limit
-        new[row[is_beside], column[is_beside]] = True
+        # Only pixels of L⁺ > 6 σ can be cosmic rays; next to one, half the height is enough.
+        edge, new = compute_edges(clean), np.zeros_like(cosmic)
+        can_be_new: np.ndarray | bool = True
+        for least_part in (1.0, 0.5):
+            is_high = (edge > 6.0 * least_part * noise) & can_be_new
+            row, column = np.nonzero(is_high & ~forbidden & ~cosmic & is_changed)
+            if not row.size:
+                break
+            sigma = _measure_noise(clean, noise, row, column)
+            height, structure = _measure_contrast(clean, edge, row, column)
+            # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
+            limit = np.maximum(6.0 * sigma, ratio * (np.maximum(structure, 0.0) + sigma))
+            is_sharp = height > least_part * limit
+            new[row[is_sharp], column[is_sharp]] = True
+            if not is_sharp.any():
+                break
+            can_be_new = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))
         if not new.any():
             break
         cosmic |= new

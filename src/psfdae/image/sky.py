@@ -23,10 +23,10 @@ from psfdae.image.fits_file import ImageFile, open_pixels
 from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, SkyStructure, noise_correlation, sky_level
 from psfdae.stars.moments import (
+    SIGMA_OF_MAD,
     count_step,
     dither,
     remove_dither,
-    robust_scatter,
     row_medians,
 )
 
@@ -172,7 +172,7 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     last_row = max(rows - square_px, 0)
     count = min(32, -(-rows // square_px))
     starts = np.unique(np.linspace(0, last_row, count).astype(int) // 2 * 2)
-    levels, noises, highest = [], [], -np.inf
+    level_parts, noise_parts, highest = [], [], -np.inf
     # Deviations from the sky in σ, band below band, with four rows without values between them.
     deviations = np.full((len(starts), square_px + 4, columns), np.nan, np.float32)
     with open_pixels(image, in_pieces=True, dtype=np.float64) as pixels:
@@ -182,22 +182,27 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
             highest = max(highest, float(np.nanmax(band, initial=-np.inf)))
             # Medians of whole counts become the medians of the counts before rounding.
             band, dither_variance = dither(band, count_step(band))
-            for column in range(0, columns, square_px):
-                square = band[:, column : column + square_px]
-                values = square[np.isfinite(square)]
-                if values.size < square_px:
-                    continue
-                # Stars in a square hardly change its median and its median deviation.
-                level = float(np.median(values))
-                noise = float(remove_dither(robust_scatter(values), dither_variance))
-                if noise > 0:
-                    # Larger ones are of stars, and could leave the range of single precision.
-                    deviation[: len(band), column : column + square_px] = np.clip(
-                        (square - level) / noise, -1e6, 1e6
-                    )
-                    levels.append(level)
-                    noises.append(noise)
-    if not levels:
+            # A row for each square; NaN beyond the last row and column.
+            pads = (0, square_px - len(band)), (0, -columns % square_px)
+            wide_band = np.pad(band, pads, constant_values=np.nan)
+            parts = wide_band.reshape(square_px, -1, square_px).swapaxes(0, 1)
+            squares = parts.reshape(-1, square_px**2)
+            # Stars in a square hardly change its median and its median deviation.
+            square_level = row_medians(squares)
+            offset = squares - square_level[:, None]
+            scatter = SIGMA_OF_MAD * row_medians(np.abs(offset))
+            square_noise = remove_dither(scatter, dither_variance)
+            is_measured = np.count_nonzero(np.isfinite(squares), axis=1) >= square_px
+            is_measured &= square_noise > 0
+            level_parts.append(square_level[is_measured])
+            noise_parts.append(square_noise[is_measured])
+            # Larger deviations are of stars, and could leave the range of single precision.
+            offset[~is_measured] = np.nan
+            offset = np.clip(offset / square_noise[:, None], -1e6, 1e6).reshape(parts.shape)
+            in_band = offset.swapaxes(0, 1).reshape(wide_band.shape)[: len(band), :columns]
+            deviation[: len(band)] = in_band
+    levels, noises = np.concatenate(level_parts), np.concatenate(noise_parts)
+    if not levels.size:
         return None
     # White pixels are found by the parity of row and column, as bands begin at even rows. Means of
     # values that are clipped at 3 σ, against stars: medians of whole counts would mostly be equal.
@@ -209,7 +214,7 @@ def sample_sky(image: ImageFile, square_px: int = 32) -> SkySample | None:
     )
     checker = float(white - black)
     # Resampled pixels share noise: sums of them scatter by more than independent ones. 512 × 512 px
-    # are enough, of which a correlation has the error 0.003.
+    # are enough, of which a correlation has the error 0.006.
     middle = tuple(slice(max(0, size // 2 - 256), size // 2 + 256) for size in bands.shape)
     correlation = noise_correlation(bands[middle])
     level, noise = float(np.median(levels)), correlation * float(np.median(noises))

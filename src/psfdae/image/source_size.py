@@ -104,18 +104,16 @@ def measure_size(data: np.ndarray, bad: np.ndarray, position: np.ndarray) -> Sou
     windows_at = (data.shape, brightest[:, 1], brightest[:, 0], 145, 0)
     windows, inside, _ = cut_image(clean, *windows_at)
     is_measured = inside & (cut_image(bad, *windows_at)[0] == 0)
-    # The centre under a window as wide as the star, from the first profile; 5 σ of it are enough.
-    visible = np.where(is_measured, windows, 0.0)
-    centre, size = np.zeros((len(windows), 2)), None
-    for _ in range(2):
-        size = measure_windows(windows, is_measured, centre)
-        if size is None:
-            return None
-        # A ring is dark in its middle: a window narrower than its radius would drift off.
-        sigma, reach_px = max(size.fwhm_px / FWHM_OF_SIGMA, 0.7), max(size.fwhm_px, 1.5)
-        middle = cut(visible, min(2 * int(np.ceil(5.0 * sigma + reach_px)) + 1, windows.shape[-1]))
-        sigmas = np.full(len(windows), sigma)
-        centre = find_centroids(middle, np.zeros_like(centre), sigmas, 10, reach_px)
+    # The centre under a window as wide as the star, from a first profile about the given positions;
+    # 5 σ of it are enough.
+    visible, centre = np.where(is_measured, windows, 0.0), np.zeros((len(windows), 2))
+    size = measure_windows(windows, is_measured, centre)
+    if size is None:
+        return None
+    # A ring is dark in its middle: a window narrower than its radius would drift off.
+    sigma, reach_px = max(size.fwhm_px / FWHM_OF_SIGMA, 0.7), max(size.fwhm_px, 1.5)
+    middle = cut(visible, min(2 * int(np.ceil(5.0 * sigma + reach_px)) + 1, windows.shape[-1]))
+    centre = find_centroids(middle, centre, np.full(len(windows), sigma), 10, reach_px)
     return measure_windows(windows, is_measured, centre)
 
 

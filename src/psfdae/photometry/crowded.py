@@ -124,7 +124,8 @@ def photometry(
     threshold : float
         Minimum S/N of stars that are found where the models of others are subtracted.
     turns : int
-        Maximum number of joint fits, at least 2; stars are looked for after all but the last two.
+        Maximum number of joint fits, at least 2; stars are looked for after all but the last two,
+        and after the first of two.
     with_wings : bool
         Measure the wings of the stars and the halos of saturated ones, which takes as long as the
         rest. Otherwise, the wings of the model are used, if it has any.
@@ -207,8 +208,8 @@ def photometry(
         is_real = find_real(position, fit, doubt, observation.count, threshold, 0.5 * fwhm)
         position, flux, origin = position[is_real], flux[is_real], origin[is_real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
-        # stars and find none.
-        if not is_listed and turn < turns - 2:
+        # stars and find none; of two fits, none drops any.
+        if not is_listed and turn < max(turns - 2, 1):
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
             known_positions = np.concatenate([position, peaks])
             new, new_flux = find_stars(psfs, sky.signal, sigma, known_positions, threshold, fwhm)

@@ -96,6 +96,9 @@ def star_bins(
     middle = np.rint(positions).astype(int)
     first = np.maximum(middle - reach, [columns.start, rows.start])
     end = np.minimum(middle + reach + 1, [columns.stop, rows.stop])
+    # Its stamp in the window: pixels less than half a stamp from the star along both axes.
+    stamp_first = np.maximum(np.floor(positions - half_px).astype(int) + 1 - first, 0)
+    stamp_end = np.maximum(np.ceil(positions + half_px).astype(int) - first, 0)
     for star in np.flatnonzero((first < end).all(axis=1)).tolist():
         (x, y), (column, row), (column_end, row_end) = positions[star], first[star], end[star]
         # Distances of the pixels from the star along either axis, and from its centre.
@@ -105,7 +108,8 @@ def star_bins(
         distance *= BINS_PER_PX
         distance += 1.5
         bins = distance.astype(np.int32)
-        bins[np.ix_(*(np.flatnonzero(np.abs(axis) < half_px) for axis in (down, across)))] = 0
+        (stamp_column, stamp_row), (column_stop, row_stop) = stamp_first[star], stamp_end[star]
+        bins[stamp_row:row_stop, stamp_column:column_stop] = 0
         window = (
             slice(row - rows.start, row_end - rows.start),
             slice(column - columns.start, column_end - columns.start),
@@ -360,7 +364,7 @@ def around_stars(
     earlier : Wings or None
         Wings with which the turns begin.
     tolerance : float
-        Turns end when the light of the wings changes by less than this fraction of its error.
+        Turns end when the light of the wings is known to this fraction of its error.
     cores : ndarray, shape (k, 3)
         Saturated cores, middle x, y and radius in px (`find_saturated_cores`).
     with_wings : bool
@@ -383,6 +387,8 @@ def around_stars(
     wings, fitted_stars = earlier, None
     # Each turn finds the sky without the wings so far, of the same structure, then the wings on
     # this sky. The sky of the last turn is off by far less than the error of the wings.
+    changes: list[float] = []
+    growth: float | None = None
     for _ in steps("light beyond the stamps", range(8)):
         residual = draw_wings(image.shape, stars, wings)
         np.subtract(without_stars, residual, out=residual)
@@ -400,9 +406,19 @@ def around_stars(
         if fit is None:
             break
         wings = fit
-        # Until their light changes by less than the given fraction of its error.
+        # The sky has taken a part of the wings that were not subtracted yet: it gives it back in
+        # turns, each a fraction ρ of the turn before. A change δ is followed by δ ρ/(1 − ρ), which
+        # is added at once as soon as two changes have shown ρ; half of that may be wrong.
         light, light_sigma = wings.light()
-        if previous is not None and abs(light - previous.light()[0]) < tolerance * light_sigma:
+        changes.append(light - (0.0 if previous is None else previous.light()[0]))
+        unknown_light = abs(changes[-1])
+        if len(changes) == 2 and abs(changes[1]) < 0.75 * abs(changes[0]):
+            growth = changes[1] / (changes[0] - changes[1])  # ρ/(1 − ρ)
+        if growth is not None and previous is not None:
+            unknown_light *= 0.5 * abs(growth)
+            step = wings.profile - previous.profile
+            wings = replace(wings, profile=wings.profile + growth * step)
+        if previous is not None and unknown_light < tolerance * light_sigma:
             break
     del residual  # of a large image, each map takes much memory
     wing_light = draw_wings(image.shape, stars, wings)

@@ -195,13 +195,13 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
         # Light outside the stamps, as the photometry of each image with this model measures it:
         # `flux_total` of a star and its flux by photometry are the same. Stars that are found in
         # the residuals of the first fit change the wings by up to two of their errors, stars of
-        # later fits by less than a quarter of one: three fits are enough.
+        # later fits by less than a quarter of one: two fits are enough.
         wings = []
         for image in stars.images:
             if not isinstance(image.observation, Image):
                 continue
             observation = add_measured_gain(model, image.observation.assume_scale())
-            photometry, _ = measure_stars(model, observation, image.source.given_threshold, 3)
+            photometry, _ = measure_stars(model, observation, image.source.given_threshold, 2)
             wings += [] if photometry.image_wings is None else [photometry.image_wings]
     if not wings:
         return model

@@ -325,6 +325,21 @@ def test_squares_of_one_value_have_8_px(rows, is_found):
     assert (is_constant == (flat & is_found)).all()
 
 
+@pytest.mark.parametrize("shift", range(8))
+def test_constant_squares_are_found_anywhere(shift):
+    """Inside, and across an edge, beyond which the image repeats its last pixels."""
+    values = np.random.default_rng(3).normal(size=(50, 60))
+    for area in (
+        np.s_[20 + shift : 28 + shift, 12 + 3 * shift : 20 + 3 * shift],
+        np.s_[:5, shift:],
+    ):
+        flat = np.zeros(values.shape, bool)
+        flat[area] = True
+        is_constant = bad_pixels.find_constant_squares(np.where(flat, 5.0, values))
+        assert is_constant.any() and (is_constant <= flat).all()
+        assert (is_constant == flat)[8:].all() and is_constant[area][:4, 8:].all()
+
+
 def test_a_mesh_far_from_the_plane_of_its_neighbours_takes_their_value():
     row, column = np.indices((6, 7))
     plane = 3.0 * row - 2.0 * column

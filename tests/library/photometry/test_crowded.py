@@ -27,7 +27,7 @@ from psfdae.image.opening import open_observation
 from psfdae.image.sky import subtract_sky
 from psfdae.image.stamps import cut_image
 from psfdae.image.trails import find_saturated_cores
-from psfdae.photometry import crowded
+from psfdae.photometry import crowded, wings_fit
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.image_photometry import add_unmeasured_rows
 from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
@@ -133,6 +133,17 @@ def test_there_are_as_many_stars_as_are_true(sky, phot):
     assert len(phot.stars) == pytest.approx(len(true), abs=0.02 * len(true))
     assert phot.residual.std() == pytest.approx(np.sqrt(SKY + 9), rel=0.15)
     assert abs(np.median(phot.residual)) < 0.5
+
+
+def test_two_fits_have_the_stars_that_one_leaves_and_the_same_wings(sky, phot):
+    """A training needs no more: stars near others are found after the first fit."""
+    folder, path, true = sky
+    observation = open_observation(ImageInput(folder / "i.fits", detect=5.0), STAMP)
+    two_fits = crowded.photometry(load_model(path), observation, 5.0, turns=2)
+    assert observation.count < 0.97 * len(true)
+    assert len(two_fits.stars) == pytest.approx(len(true), abs=0.02 * len(true))
+    light, error = phot.image_wings.light()
+    assert two_fits.image_wings.light()[0] == pytest.approx(light, abs=0.3 * error)
 
 
 def test_aperture_corrections(phot):
@@ -500,6 +511,33 @@ def test_wings_that_no_star_of_an_image_shows_stay_the_earlier_ones(earlier):
     assert wings_after is wings
     assert wing_light == pytest.approx(light)
     assert np.median(sky.level) == pytest.approx(50.0, abs=0.3)
+
+
+def test_wings_and_sky_settle_in_two_fits(monkeypatch):
+    """The light of two turns is the limit of many, to the given part of its error."""
+    rng = np.random.default_rng(3)
+    shape, count = (400, 400), 150
+    flux, place = 10 ** rng.uniform(3, 5, count), rng.uniform(0, 400, (count, 2))
+    stars = StarFluxes(place, flux, np.full(count, 0.03))
+    true = Wings(RADIUS, np.geomspace(2e-4, 7e-5, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    image = 300.0 + draw_wings(shape, stars, true) + rng.normal(0.0, 15.0, shape)
+    sky, nothing, fits = subtract_sky(image, np.zeros(shape, bool)), np.zeros(shape), []
+
+    def count_fit(*args):
+        fits.append(fit_wings(*args))
+        return fits[-1]
+
+    monkeypatch.setattr(wings_fit, "fit_wings", count_fit)
+    args = image, sky, sky.noise, nothing, stars, 10
+    no_cores = np.empty((0, 3))
+    wings = around_stars(*args, None, 0.3, no_cores)[2]
+    fit_count, limit = len(fits), wings
+    for _ in range(3):
+        limit = around_stars(*args, limit, 0.01, no_cores)[2]
+    light, error = limit.light()
+    # The sky takes a part of the wings, which one fit alone does not give back.
+    assert abs(fits[0].light()[0] - light) > error
+    assert 2 <= fit_count <= 3 and abs(wings.light()[0] - light) < 0.3 * error
 
 
 @pytest.mark.parametrize("distance", [9, 60])

@@ -53,8 +53,9 @@ class Node(NamedTuple):
         `terms` (n, K) are the terms of the field at the positions of n stars.
         """
         # p_k / Σ_k p_k ΣM_k for the terms, 1 for the mean residual.
-        sums = (terms @ self.image_sums)[:, None]
-        return np.hstack([terms / sums, np.ones((len(terms), 1))])
+        weights = np.ones((len(terms), len(self.images)))
+        weights[:, :-1] = terms / (terms @ self.image_sums)[:, None]
+        return weights
 
 
 def node_step(fwhm_px: float, max_step_px: float, max_step_fwhm: float = 0.125) -> float:

@@ -180,21 +180,24 @@ def project_pairs(prior: FieldPrior, stars: FieldStamps, is_nearby: np.ndarray) 
     pairs = Pairs(star, node, *(np.empty((len(star), 2, columns)) for columns in (axis_count, 5)))
     square = np.square(images).sum(axis=1)
     for k, rows in pairs.iterate_nodes():
-        derivatives, axes = prior.nodes[k].derivatives, prior.node_axes(k, stars.position_known)
-        image, mean = images[star[rows]], stars.psfs(prior, k, star[rows])
+        lattice_node, axes = prior.nodes[k], prior.node_axes(k, stars.position_known)
+        image = images[star[rows]]
         # x and m along the axes. m is a weighted sum of the node's images, whose projections on the
         # axes (`axes.images`) are stored.
         along, products = pairs.along[rows], pairs.products_beyond[rows]
         along[:, 0] = image @ axes.basis[3:].T
         if stars.centre is None:
-            along[:, 1] = prior.nodes[k].image_weights(stars.terms[star[rows]]) @ axes.images
+            weights = lattice_node.image_weights(stars.terms[star[rows]])
+            mean, along[:, 1] = weights @ lattice_node.images, weights @ axes.images
         else:
+            mean = stars.psfs(prior, k, star[rows])
             along[:, 1] = mean @ axes.basis[3:].T
         # Products in the complement: products over all pixels minus products along the axes.
         products[:, 0, 0] = square[star[rows]]
         products[:, 0, 1] = products[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
         products[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
-        products[:, 0, 2:], products[:, 1, 2:] = image @ derivatives.T, mean @ derivatives.T
+        derivatives = lattice_node.derivatives.T
+        products[:, 0, 2:], products[:, 1, 2:] = image @ derivatives, mean @ derivatives
         products -= _products(along, along, axes.derivatives)
     return pairs
 
