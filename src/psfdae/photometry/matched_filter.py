@@ -58,7 +58,7 @@ def find_stars(
         middle = np.stack([columns, np.full(len(columns), top)], axis=1) + tile_px // 2
         centre = (middle[:, None] + PHASES_PX).reshape(-1, 2)
         corner, faint = np.repeat(middle - half_px, 4, axis=0), np.zeros(len(centre))
-        psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)[:, 0]
+        psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)
         # The tiles with a margin of a pixel more than the PSF reaches; σ is infinite off the image.
         first, end = max(top - margin, 0), min(top + tile_px + margin, height)
         pads = (first - top + margin, top + tile_px + margin - end), (margin, margin + tile_px)

@@ -35,7 +35,7 @@ def lit(grid, place, flux, shape=(SIZE, SIZE)):
     light = np.zeros((shape[0] + 40, shape[1] + 40))
     corner = np.rint(place).astype(int) - 10
     for (column, row), f, star in zip(corner, flux, grid.stamps(place, corner, 21), strict=True):
-        light[row + 20 : row + 41, column + 20 : column + 41] += f * star[0]
+        light[row + 20 : row + 41, column + 20 : column + 41] += f * star
     return light[20:-20, 20:-20]
 
 
@@ -55,10 +55,10 @@ def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
     residual = rng.normal(0, sigma) + lit(grid, np.array([phase]) + 15, [50.0], (31, 31))
     corner = np.array([[9, 9]])
     phases = 15 + 0.5 * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
-    psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)[:, 0]
+    psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)
     # Most of the scatter is below 1 by a factor: the noise is that of σ.
     (snr,), (flux,) = measure_snr(residual[None], sigma[None], psf[None])
-    star = grid.stamps(np.array([phase]) + 15, corner, 13)[0, 0]
+    star = grid.stamps(np.array([phase]) + 15, corner, 13)[0]
     weight = sigma[9:22, 9:22] ** -2.0
     information = (star**2 * weight).sum()
     expected = (star * residual[9:22, 9:22] * weight).sum() / information
@@ -85,7 +85,7 @@ def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):
     """Nearly all stars of S/N 7 are found, with positions and fluxes, in all units of a sky."""
     rng, grid = np.random.default_rng(2), gaussian_grid(fwhm, side=32 if fwhm > 5 else 16)
     flux = 7.0 / np.sqrt(
-        np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0, 0]).sum()
+        np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0]).sum()
     )
     scattered = scattered[:: 1 if fwhm < 5 else 7]  # far enough from each other
     light = lit(grid, scattered, np.full(len(scattered), flux))
