@@ -532,7 +532,7 @@ def exceeds_limit(
     structure = _measure_structure(image, row[is_sharp], column[is_sharp])
     limit = part * ratio * (np.maximum(structure, 0.0) + sigma[is_sharp])
     is_sharp[is_sharp] = height[is_sharp] > limit
-    return is_sharp
+    return np.asarray(is_sharp)
 
 
 def measure_sharpness(

@@ -65,9 +65,9 @@ def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> Bad
     if square_px > 1:
         # Rows and columns of pixels in squares; the last ones may be in none.
         rows, columns = (size // square_px for size in image.shape)
-        squares = np.s_[: rows * square_px, : columns * square_px]
+        inside = np.s_[: rows * square_px, : columns * square_px]
         values, count = (
-            pixels[squares].reshape(rows, square_px, columns, square_px).sum(axis=(1, 3))
+            pixels[inside].reshape(rows, square_px, columns, square_px).sum(axis=(1, 3))
             for pixels in (np.where(bad, 0.0, image), ~bad)
         )
         values, bad = values / np.maximum(count, 1).astype(values.dtype), count == 0

@@ -648,6 +648,31 @@ def find_rings(
     return Rings(window, offset, round_offset, radius, ring, *profile)
 
 
+def fit_shape(
+    rings: Rings, residual: np.ndarray, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the middle of rings is off, (2,), and the matrix (2, 2) that rounds them.
+
+    Residual and σ (h, w) are as in `measure_halo`.
+    """
+    data, light, radius = residual[rings.window], rings.draw_light(rings.radius), rings.radius
+    # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
+    # stretches g₁ along the axes and g₂ along the diagonals leave r h' (g₁ cos 2φ + g₂ sin 2φ).
+    # Least squares, where uneven light counts as an error of 30 %.
+    doubt = np.hypot(sigma[rings.window], 0.3 * light)
+    is_fitted = (rings.number > 0) & (np.abs(data - light) < 3.0 * doubt)
+    is_fitted &= np.log(np.maximum(radius, 1.0)) < rings.log_radius[-1]
+    slopes = np.stack(np.gradient(light))
+    along = (slopes * rings.offset).sum(axis=0) / np.maximum(radius, 1.0) ** 2  # h'/r
+    down, across = rings.round_offset
+    stretches = [-along * (down**2 - across**2), -along * 2.0 * down * across]
+    design = np.stack([*slopes, *stretches])[:, is_fitted] / doubt[is_fitted]
+    change = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
+    along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
+    stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
+    return np.clip(change[:2], -1.0, 1.0), np.array(stretch)
+
+
 def measure_halo(
     residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
 ) -> Halo | None:
@@ -673,36 +698,22 @@ def measure_halo(
         None if no two rings that follow each other show a halo.
     """
     middle, to_circle = core[1::-1].astype(float), np.eye(2)
-    # Four turns fit the shape of the rings, and the last one measures them.
-    for turn in range(5):
-        rings = find_rings(residual, bad, sigma, core, middle, to_circle)
+    rings = find_rings(residual, bad, sigma, core, middle, to_circle)
+    for _ in range(4):
         if rings is None:
             return None
-        data, radius, light = residual[rings.window], rings.radius, rings.draw_light(rings.radius)
-        if turn == 4:
-            break
-        # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
-        # stretches g₁ along the axes and g₂ along the diagonals leave r h' (g₁ cos 2φ + g₂ sin 2φ).
-        # Least squares, where uneven light counts as an error of 30 %.
-        doubt = np.hypot(sigma[rings.window], 0.3 * light)
-        is_fitted = (rings.number > 0) & (np.abs(data - light) < 3.0 * doubt)
-        is_fitted &= np.log(np.maximum(radius, 1.0)) < rings.log_radius[-1]
-        slopes = np.stack(np.gradient(light))
-        along = (slopes * rings.offset).sum(axis=0) / np.maximum(radius, 1.0) ** 2  # h'/r
-        down, across = rings.round_offset
-        stretches = [-along * (down**2 - across**2), -along * 2.0 * down * across]
-        design = np.stack([*slopes, *stretches])[:, is_fitted] / doubt[is_fitted]
-        change = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
-        middle += np.clip(change[:2], -1.0, 1.0)
-        along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
-        stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
-        to_circle = stretch @ to_circle
+        move, stretch = fit_shape(rings, residual, sigma)
+        middle, to_circle = middle + move, stretch @ to_circle
+        rings = find_rings(residual, bad, sigma, core, middle, to_circle)
+    if rings is None:
+        return None
     # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, whose
     # variance is 8 times the variance e² of the ring's median. σ² is their mean square minus 7 e²,
     # at least e². Outside of the rings that show the halo, σ is half of the light.
     eighth = np.floor(np.arctan2(*rings.offset) * 4.0 / np.pi).astype(int) % 8
     count = 8 * int(rings.number.max()) + 8
-    uneven = label_medians(data - light, rings.number * 8 + eighth, count).reshape(-1, 8)
+    remainder = residual[rings.window] - rings.draw_light(rings.radius)
+    uneven = label_medians(remainder, rings.number * 8 + eighth, count).reshape(-1, 8)
     noise_variance = np.square(rings.error)
     variance = np.nanmean(np.square(uneven[rings.halo_rings]), axis=1) - 7.0 * noise_variance
     ring_error = np.sqrt(np.maximum(variance, noise_variance))
