@@ -79,6 +79,23 @@ def test_nothing_is_found_in_the_light_of_a_star_of_any_brightness(flux):
     assert found_flux == pytest.approx([60.0], rel=0.3)
 
 
+@pytest.mark.parametrize("place", [(130.0, 61.0), (4.0, 178.0)])
+def test_a_search_near_a_star_that_changed_finds_what_a_search_of_all_finds_there(scattered, place):
+    """Also at the edge of a tile of 64 px, or of the image."""
+    grid, place = gaussian_grid(3.2), np.array([place])
+    image = np.random.default_rng(2).normal(0, 1, (SIZE, SIZE))
+    image += lit(grid, scattered, np.full(len(scattered), 50.0))
+    maps = image, np.ones(image.shape), NOBODY, 4.0, 3.2
+    everywhere, flux = find_stars(grid, *maps)
+    nearby, nearby_flux = find_stars(grid, *maps, place)
+    rows = cKDTree(everywhere).query(nearby)[1]
+    assert (nearby == everywhere[rows]).all() and (nearby_flux == flux[rows]).all()
+    is_near = np.abs(everywhere - place).max(axis=1) < grid.side_px // 2
+    assert is_near.sum() >= 1 and set(np.flatnonzero(is_near)) <= set(rows)
+    assert np.abs(nearby - place).max() < 64 + 2 * grid.side_px
+    assert not len(find_stars(grid, *maps, np.empty((0, 2)))[0])
+
+
 @pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
 @pytest.mark.parametrize("fwhm", [1.6, 3.2, 8.0])
 def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):
