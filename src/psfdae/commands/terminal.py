@@ -15,10 +15,13 @@ from threading import Lock, Timer
 
 from psfdae.base.progress import Show
 
+DELAY_S = 0.5
+"""Shorter tasks have no bar. A command takes up to 1.5 s to begin its first task."""
+
 
 @contextmanager
 def bar(name: str) -> Iterator[Show]:
-    """Show a task as a bar of click's after its first second; without a terminal, show nothing.
+    """Show a task as a bar of click's after half a second; without a terminal, show nothing.
 
     The bar appears even if no step of the task has ended by then.
     """
@@ -50,14 +53,14 @@ def bar(name: str) -> Iterator[Show]:
 
         def show(fraction: float, text: str) -> None:
             with lock:
-                if not is_shown and time.time() > start + 1.0:
+                if not is_shown and time.time() > start + DELAY_S:
                     begin()
                 if is_shown:
                     # Two parts of one step both begin at 0: the bar never goes back.
                     steps = max(round(length * fraction) - progress_bar.pos, 0)
                     progress_bar.update(steps, text)
 
-        timer = Timer(1.0, begin_late)
+        timer = Timer(DELAY_S, begin_late)
         timer.daemon = True
         timer.start()
         try:

@@ -7,7 +7,7 @@ sky, detection and fits leave out. Each function below finds one kind of bad pix
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -481,29 +481,58 @@ def find_cosmic_rays_in_band(
     # where pixels of the windows about a pixel changed.
     is_changed: np.ndarray | bool = True
     for _ in range(8):
-        # Only pixels of L⁺ > 6 σ can be cosmic rays; next to one, half the height is enough.
-        edge, new = compute_edges(clean), np.zeros_like(cosmic)
-        can_be_new: np.ndarray | bool = True
-        for least_part in (1.0, 0.5):
-            is_high = (edge > 6.0 * least_part * noise) & can_be_new
-            row, column = np.nonzero(is_high & ~forbidden & ~cosmic & is_changed)
-            if not row.size:
-                break
-            sigma = _measure_noise(clean, noise, row, column)
-            height, structure = _measure_contrast(clean, edge, row, column)
-            # L⁺ > 6 σ and L⁺ > ratio · (F + σ).
-            limit = np.maximum(6.0 * sigma, ratio * (np.maximum(structure, 0.0) + sigma))
-            is_sharp = height > least_part * limit
-            new[row[is_sharp], column[is_sharp]] = True
-            if not is_sharp.any():
-                break
-            can_be_new = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))
+        # L⁺ of all pixels. It is nowhere below 0, and neither is its median: where L⁺ is below the
+        # limit, so is L⁺ less its median.
+        edge = compute_edges(clean)
+        can_be_new = ~(forbidden | cosmic) & is_changed
+        row, column = np.nonzero((edge > 6.0 * noise) & can_be_new)
+        new = np.zeros_like(cosmic)
+        is_sharp = exceeds_limit(clean, edge, noise, row, column, ratio)
+        new[row[is_sharp], column[is_sharp]] = True
+        # Next to a cosmic ray, half the height is enough for both.
+        is_beside = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))
+        row, column = np.nonzero((edge > 3.0 * noise) & can_be_new & is_beside & ~new)
+        is_sharp = exceeds_limit(clean, edge, noise, row, column, ratio, part=0.5)
+        new[row[is_sharp], column[is_sharp]] = True
         if not new.any():
             break
         cosmic |= new
         clean = fill_bad(clean, cosmic | bad)[0]
         is_changed = scipy.ndimage.maximum_filter(new, 15)
     return cosmic
+
+
+def exceeds_limit(
+    image: np.ndarray,
+    edge: np.ndarray,
+    noise: np.ndarray,
+    row: np.ndarray,
+    column: np.ndarray,
+    ratio: float,
+    part: float = 1.0,
+) -> np.ndarray:
+    """Return True for pixels (n,) as sharp as a cosmic ray, or as a part of that.
+
+    The limit of L⁺ is 6 σ, or the ratio times F + σ where this is more. Fine structure takes the
+    most time: it is measured only where L⁺ reaches the limit without it.
+
+    Parameters
+    ----------
+    image, edge, noise : ndarray, shape (h, w)
+        Image without bad pixels, its positive Laplacian, and σ of its pixels.
+    row, column : ndarray of int, shape (n,)
+        Positions of the pixels, from 0.
+    ratio : float
+        Minimum L⁺ over F + σ of a cosmic ray.
+    part : float
+        Fraction of the limit that is enough.
+    """
+    height, sigma = _measure_height(edge, row, column), _measure_noise(image, noise, row, column)
+    is_sharp = height > part * np.maximum(6.0, ratio) * sigma
+    structure = _measure_structure(image, row[is_sharp], column[is_sharp])
+    limit = part * ratio * (np.maximum(structure, 0.0) + sigma[is_sharp])
+    is_sharp[is_sharp] = height[is_sharp] > limit
+    return np.asarray(is_sharp)
 
 
 def measure_sharpness(
@@ -540,8 +569,8 @@ def measure_sharpness(
         row, column = row[brightest], column[brightest]
         # Ratio L⁺/F of each; F is at least the noise, so that flat surroundings are not taken for
         # sharp.
-        height, structure = _measure_contrast(clean, edge, row, column)
-        ratio = height / np.maximum(structure, sigma[row, column])
+        height = _measure_height(edge, row, column)
+        ratio = height / np.maximum(_measure_structure(clean, row, column), sigma[row, column])
         ratios.append(ratio[ratio < 20.0])
     return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
 
@@ -563,35 +592,30 @@ def compute_edges(image: np.ndarray) -> np.ndarray:
     return np.asarray(sum(quarters) / 8.0)
 
 
-def _measure_contrast(
-    image: np.ndarray, edge: np.ndarray, row: np.ndarray, column: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Measure L⁺ above its surroundings, and the fine structure F, at some pixels (n,).
+def _measure_height(edge: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Measure L⁺ (h, w) less its median over 5 × 5 pixels, which is free of smooth sources, (n,).
 
-    L⁺ less its median over 5 × 5 pixels is free of smooth sources. F is the median over 3 × 3
-    pixels less the median over 7 × 7 of these medians.
-
-    Parameters
-    ----------
-    image, edge : ndarray, shape (h, w)
-        Image, and its positive Laplacian (`compute_edges`).
-    row, column : ndarray of int, shape (n,)
-        Positions of the pixels, from 0.
+    Pixels are given by their rows and columns, from 0.
     """
-    # Windows of 5 × 5 px of L⁺ and of 9 × 9 px of the image, 4096 at a time to bound the memory.
-    height, structure = np.empty((2, len(row)))
-    wide_edge, wide_image = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
-    fives = np.lib.stride_tricks.sliding_window_view(wide_edge, (5, 5))
-    nines = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
-    for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
-        at = row[part], column[part]
-        height[part] = edge[at] - np.median(fives[at].reshape(-1, 25), axis=1)
+    height = np.empty(len(row))
+    for part, fives in _cut_windows(edge, row, column, 2):
+        height[part] = fives[:, 2, 2] - np.median(fives.reshape(-1, 25), axis=1)
+    return height
+
+
+def _measure_structure(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Measure the fine structure F of an image (h, w) at pixels (n,) of some rows and columns.
+
+    F is the median over 3 × 3 pixels less the median over 7 × 7 of these medians.
+    """
+    structure = np.empty(len(row))
+    for part, nines in _cut_windows(image, row, column, 4):
         # Medians over 3 × 3 pixels at the 7 × 7 positions about the pixel; the one in the middle
         # is its own.
-        threes = np.lib.stride_tricks.sliding_window_view(nines[at], (3, 3), axis=(1, 2))
+        threes = np.lib.stride_tricks.sliding_window_view(nines, (3, 3), axis=(1, 2))
         medians = np.median(threes.reshape(-1, 7, 7, 9), axis=3)
         structure[part] = medians[:, 3, 3] - np.median(medians.reshape(-1, 49), axis=1)
-    return height, structure
+    return structure
 
 
 def _measure_noise(
@@ -603,9 +627,22 @@ def _measure_noise(
     """
     # Median |x₁ − x₂| of the neighbours in 9 × 9 px, over √2.
     scatter = np.empty(len(row))
-    wide_image = np.pad(image, 4, mode="edge")
-    nines = np.lib.stride_tricks.sliding_window_view(wide_image, (9, 9))
-    for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
-        difference = np.abs(np.diff(nines[row[part], column[part]], axis=2)).reshape(-1, 72)
+    for part, nines in _cut_windows(image, row, column, 4):
+        difference = np.abs(np.diff(nines, axis=2)).reshape(-1, 72)
         scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
     return np.asarray(np.maximum(scatter, noise[row, column]))
+
+
+def _cut_windows(
+    image: np.ndarray, row: np.ndarray, column: np.ndarray, reach_px: int
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield slices of some pixels (n,), and windows (k, s, s) of the image (h, w) about these.
+
+    A window reaches some pixels to each side; pixels at the edge of the image are repeated.
+    """
+    # 4096 windows at a time, to bound the memory.
+    axis, (height, width) = np.arange(-reach_px, reach_px + 1), image.shape
+    for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
+        rows = np.clip(row[part, None] + axis, 0, height - 1)
+        columns = np.clip(column[part, None] + axis, 0, width - 1)
+        yield part, image[rows[:, :, None], columns[:, None]]

@@ -63,11 +63,14 @@ def add_trails(image: np.ndarray, bad_pixels: BadPixels, saturate: float) -> Bad
     square_px = max(min(image.shape) // 1000, 1)
     values, bad = image, bad_pixels.mask
     if square_px > 1:
-        from astropy.nddata import block_reduce
-
-        values = block_reduce(np.where(bad, 0.0, image), square_px, np.sum)
-        count = block_reduce(~bad, square_px, np.sum).astype(values.dtype)
-        values, bad = values / np.maximum(count, 1), count == 0
+        # Rows and columns of pixels in squares; the last ones may be in none.
+        rows, columns = (size // square_px for size in image.shape)
+        inside = np.s_[: rows * square_px, : columns * square_px]
+        values, count = (
+            pixels[inside].reshape(rows, square_px, columns, square_px).sum(axis=(1, 3))
+            for pixels in (np.where(bad, 0.0, image), ~bad)
+        )
+        values, bad = values / np.maximum(count, 1).astype(values.dtype), count == 0
     # Saturated cores do not become bad pixels, so that these stars are flagged as saturated.
     is_saturated = (values >= saturate) & ~bad
     is_core = scipy.ndimage.binary_dilation(is_saturated, np.ones((3, 3)), 3)
@@ -120,7 +123,6 @@ def find_spikes(
     spikes, cores = np.zeros(image.shape, dtype=bool), find_saturated_cores(is_saturated)
     if not len(cores):
         return spikes
-    from astropy.nddata import overlap_slices
     from skimage.transform import warp_polar
 
     snr = smooth_light(image, bad, sky) / sky.noise
@@ -167,7 +169,7 @@ def find_spikes(
             length = (is_ray & (count >= max(3, run))) * part_number
             end_px = np.maximum(end_px, (first_part + length.max(axis=1)) * part_px)
         # Pixels of these rays outside the core, in a window around it.
-        window, _ = overlap_slices(image.shape, (2 * reach_px + 1,) * 2, (int(y), int(x)))
+        window = cut_window(np.array(middle), reach_px, image.shape)
         row, column = np.mgrid[window] - np.array(middle)[:, None, None]
         turns = np.arctan2(row, column) / (2.0 * np.pi) % 1.0
         ray = (turns * angles).astype(int) % angles
@@ -198,6 +200,14 @@ def find_saturated_cores(is_saturated: np.ndarray) -> np.ndarray:
         row, column = np.argwhere(depth == depth.max()).mean(axis=0)
         core[:] = column + boxes[index][1].start, row + boxes[index][0].start, depth.max()
     return cores
+
+
+def cut_window(middle: np.ndarray, reach_px: int, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the rows and columns of an image (h, w) up to a distance from a row and column."""
+    return tuple(
+        slice(max(at - reach_px, 0), min(at + reach_px + 1, size))
+        for at, size in zip(np.rint(middle).astype(int).tolist(), shape, strict=True)
+    )
 
 
 def smooth_light(image: np.ndarray, bad: np.ndarray, sky: SkyLevel) -> np.ndarray:

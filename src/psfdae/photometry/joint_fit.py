@@ -21,10 +21,6 @@ from psfdae.base.progress import steps
 from psfdae.base.types import csc_array
 from psfdae.psf.grid import PsfGrid
 
-MOST_SPLINE_BYTES = 2**28
-"""Memory in which the PSFs of all stars are kept during a fit: 14,000 stars in stamps of 16 px, or
-900 in stamps of 64 px."""
-
 
 @dataclass(frozen=True)
 class JointFit:
@@ -92,23 +88,27 @@ def fit_stars(
         Positions that are known independently of this image, and their standard error along either
         axis, px: the fit is the most probable one, given these. By default, pixels alone decide.
     """
-    fit = _Fit(psfs, image, error, bad, position, flux, min(box_px, psfs.side_px))
+    fit = _Fit(psfs, image, error, bad, position, flux, min(box_px, psfs.side_px), range_px)
     middle = fit.start if origin is None else origin[fit.stars]
     # A position is known to its range: an even chance of ± a has the variance a²/3.
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
     if position_prior is not None:
         fit.prior_position, fit.pull = position_prior[0][fit.stars], 1.0 / position_prior[1] ** 2
         prior[1:] = fit.pull
-    damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.cost()
-    moving = np.ones(len(fit.stars), dtype=bool)
+    count, group, cost = len(fit.stars), chains(fit.start, range_px), fit.cost()
+    damping, moving, is_active = np.zeros(count), *np.ones((2, count), dtype=bool)
+    # Stars are at most half a pixel off the middles of their boxes: no two boxes of different
+    # clusters overlap, whose equations are thus independent.
+    cluster = chains(fit.start, max(fit.box_px, range_px), norm=np.inf)
     # Stars without neighbours take three or four steps, close pairs ten.
     for _ in steps("joint fit", range(15)):
-        design = fit.design()
-        step, gradient = fit.solve(design, prior, damping)
+        rows = np.flatnonzero(is_active)
+        step, gradient = np.zeros((2, count, fit.parameters))
+        step[rows], gradient[rows] = fit.solve(fit.design(rows), prior, damping[rows], rows)
         # No farther at once than the light is nearly linear in the position, nor out of its range.
         move = np.clip(step[:, 1:], -range_px / 4, range_px / 4)
         move = np.clip(fit.position + move, middle - range_px, middle + range_px) - fit.position
-        step = np.column_stack([step[:, 0], move])
+        step[rows, 1:] = move[rows]
         # A group is at rest if its χ² would fall by less than 0.01: it is within 0.1 σ.
         expected_gain = np.bincount(group, (step * gradient).sum(axis=1))
         moving = (expected_gain > 0.01)[group]
@@ -119,40 +119,47 @@ def fit_stars(
         fit.move(rows, step[rows])
         # Levenberg (1944, Q. Appl. Math. 2, 164): a step of a group after which it fits worse is
         # taken back, and the next one is shorter the less this one was worth what was expected.
-        new_cost = fit.cost()
+        earlier_cost, new_cost = cost, fit.cost()
         gain = np.bincount(group, cost - new_cost)
         is_worse, is_poor = ((gain < part * expected_gain)[group] & moving for part in (-0.5, 0.1))
         back = np.flatnonzero(is_worse)
         fit.move(back, -step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.cost() if len(back) else new_cost
+        # A cluster in whose boxes nothing has changed, and that is not damped, would get the same
+        # steps as before, which were not worth to be taken.
+        is_changed = (cost != earlier_cost) | (new_cost != earlier_cost) | (damping > 1e-3)
+        is_active = (np.bincount(cluster, is_changed) > 0)[cluster]
     bound = np.abs(fit.position - middle) > 0.999 * range_px
     return fit.result(len(position), prior, moving, bound)
 
 
-def pairs_within(position: np.ndarray, distance_px: float) -> np.ndarray:
+def pairs_within(position: np.ndarray, distance_px: float, norm: float = 2.0) -> np.ndarray:
     """Return the pairs of stars that are nearer to each other than a distance, (k, 2), by number.
 
-    Stars of which no position (n, 2) is known are in no pair.
+    Stars of which no position (n, 2) is known are in no pair. With the norm inf, the distance is
+    the larger one along the two axes.
     """
     from scipy.spatial import cKDTree
 
     rows_with_position = np.flatnonzero(np.isfinite(position).all(axis=1))
     # The tree numbers the located stars.
-    pairs = cKDTree(position[rows_with_position]).query_pairs(distance_px, output_type="ndarray")
+    tree = cKDTree(position[rows_with_position])
+    pairs = tree.query_pairs(distance_px, norm, output_type="ndarray")
     return np.asarray(rows_with_position[pairs])
 
 
-def chains(position: np.ndarray, distance_px: float) -> np.ndarray:
+def chains(position: np.ndarray, distance_px: float, norm: float = 2.0) -> np.ndarray:
     """Return the numbers (n,) from 0 of the chains of stars nearer to each other than a distance.
 
-    A star of which no position (n, 2) is known is a chain of its own.
+    A star of which no position (n, 2) is known is a chain of its own. For the `norm`, see
+    `pairs_within`.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     # Chains are the connected components of the graph of these pairs.
-    pairs = pairs_within(position, distance_px)
+    pairs = pairs_within(position, distance_px, norm)
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(position),) * 2)
     return np.asarray(connected_components(links, directed=False)[1])
 
@@ -160,8 +167,8 @@ def chains(position: np.ndarray, distance_px: float) -> np.ndarray:
 class _Fit:
     """State of a fit of m stars: their positions and fluxes, and the residuals of the image.
 
-    The image has a border, as wide as a stamp, of pixels that do not count, so that stamps of
-    stars at its edge are whole.
+    The image has a border of pixels that do not count, as wide as a stamp and as the whole range of
+    a star, so that the light of stars at its edge is whole.
     """
 
     parameters = 3  # of a star: flux, and position x and y
@@ -175,12 +182,13 @@ class _Fit:
         position: np.ndarray,
         flux: np.ndarray | None,
         box_px: int,
+        range_px: float,
     ) -> None:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
         # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
-        side = psfs.side_px
-        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float32), side)
-        weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), side)
+        self.border = psfs.side_px + int(np.ceil(2.0 * range_px))
+        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float32), self.border)
+        weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), self.border)
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
         on_image = np.isfinite(position).all(axis=1)
@@ -189,14 +197,15 @@ class _Fit:
         ).all(axis=1)
         self.stars = np.flatnonzero(on_image)
         self._middle = np.rint(position[self.stars]).astype(int)
-        pixels = np.count_nonzero(weight.ravel()[self._pixel_numbers(box_px)], axis=(1, 2))
+        boxes = self._pixel_numbers(self._middle - box_px // 2, box_px)
+        pixels = np.count_nonzero(weight.ravel()[boxes], axis=(1, 2))
         is_fitted = pixels >= self.parameters
         self.stars, self._middle, self.pixels = (
             values[is_fitted] for values in (self.stars, self._middle, pixels)
         )
-        # Pixels of the boxes, which decide on a star, and of its whole stamp. Rows of the design
-        # are the pixels of all boxes.
-        self.boxes = self._pixel_numbers(box_px)
+        # Pixels of the boxes, which decide on a star. Rows of the design are the pixels of all
+        # boxes.
+        self.boxes = boxes[is_fitted]
         self._rows = np.unique(self.boxes, return_inverse=True)[1].reshape(self.boxes.shape)
         # Positions and fluxes at the start, the stars' light and its derivatives there.
         self.weight = weight.ravel()[self.boxes]
@@ -207,8 +216,9 @@ class _Fit:
         # Positions that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_position, self.pull = self.start, 0.0
         # A star moves so little that its PSF stays as it is at the start, of these fluxes.
-        self._mix_splines()
-        self._light = np.empty((len(self.stars), side, side), np.float32)
+        self._psf_flux = self.flux.copy()
+        self._corner = np.empty((len(self.stars), 2), int)
+        self._light = np.empty((len(self.stars), psfs.psf_px, psfs.psf_px), np.float32)
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
         rows = np.arange(len(self.stars))
         self._draw(rows)
@@ -217,39 +227,32 @@ class _Fit:
             self.flux = self.solve_fluxes()
             # Where the PSF changes with the magnitude, these fluxes determine it from now on.
             if self.psfs.magnitudes.size:
-                self._mix_splines()
+                self._psf_flux = self.flux.copy()
                 self._draw(rows)
         self._subtract(rows, self.flux)
 
-    def _pixel_numbers(self, side_px: int, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return the numbers (m, s, s) of the pixels about stars in the image with its border."""
-        axis = np.arange(side_px) - side_px // 2 + self.psfs.side_px
-        row, column = (self._middle[rows, k, None] + axis for k in (1, 0))
-        return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
+    def _pixel_numbers(self, corner: np.ndarray, side_px: int) -> np.ndarray:
+        """Return the numbers (m, s, s) of pixels in the image with its border.
 
-    def _mix_splines(self) -> None:
-        """Make the PSFs of the stars at the start with their present fluxes.
-
-        If all together take too much memory, they are made again whenever stars are drawn.
+        `corner` (m, 2) has column and row of the first pixel of each square in the image.
         """
-        self._psf_flux, self._splines = self.flux.copy(), None
-        if len(self.stars) * self.psfs.splines[0].nbytes <= MOST_SPLINE_BYTES:
-            self._splines = self.psfs.mix_splines(self.start, self.flux)
+        row, column = (corner[:, k, None] + np.arange(side_px) + self.border for k in (1, 0))
+        return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
     def _draw(self, rows: np.ndarray) -> None:
         """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
-        # Of a stamp, the box in its middle decides. 512 stars at a time, for memory.
-        side = self.psfs.side_px
-        edge = (side - self.box_px) // 2
-        for part in np.array_split(rows, len(rows) // 512 + 1):
-            corner = self._middle[part] - side // 2
-            if self._splines is None:
-                splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
-            else:
-                splines = self._splines[part]
-            stamps = self.psfs.stamps(self.position[part], corner, side, splines=splines)
-            self._light[part] = stamps[:, 0]
-            self._derivatives[part] = stamps[:, :, edge : side - edge, edge : side - edge]
+        # 256 stars at a time: PSFs of all stars would take more memory than the image.
+        for part in np.array_split(rows, len(rows) // 256 + 1):
+            position, box_corner = self.position[part], self._middle[part] - self.box_px // 2
+            splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+            self._corner[part] = self.psfs.find_corners(position)
+            stamps = position, self._corner[part], self.psfs.psf_px
+            self._light[part] = self.psfs.stamps(*stamps, splines=splines)
+            # The box stays where it is while the stamp moves with its star: its light is drawn by
+            # itself, with its derivatives.
+            box = position, box_corner, self.box_px, None, splines
+            self._derivatives[part, 0] = self.psfs.stamps(*box)
+            self._derivatives[part, 1:] = self.psfs.slopes(*box)
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""
@@ -257,12 +260,14 @@ class _Fit:
         # stars at a time, for memory.
         for part in np.array_split(np.arange(len(rows)), len(rows) // 512 + 1):
             light = flux[part, None, None].astype(np.float32) * self._light[rows[part]]
-            numbers = self._pixel_numbers(self.psfs.side_px, rows[part])
+            numbers = self._pixel_numbers(self._corner[rows[part]], self.psfs.psf_px)
             np.subtract.at(self.residual.reshape(-1), numbers.ravel(), light.ravel())
 
     def solve_fluxes(self) -> np.ndarray:
         """Return the fluxes (m,) that fit best at the positions as they are."""
-        return self.solve(self._derivatives[:, :1] * self.weight[:, None], np.zeros(1))[0][:, 0]
+        design = self._derivatives[:, :1] * self.weight[:, None]
+        rows = np.arange(len(design))
+        return self.solve(design, np.zeros(1), np.zeros(len(rows)), rows)[0][:, 0]
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
         """Change flux, x and y of some stars by (k, 3)."""
@@ -273,11 +278,12 @@ class _Fit:
         self._draw(rows)
         self._subtract(rows, self.flux[rows])
 
-    def design(self) -> np.ndarray:
-        """Return the derivatives (m, 3, b, b) of the light by flux, x and y, in units of σ."""
+    def design(self, rows: np.ndarray) -> np.ndarray:
+        """Return the derivatives (k, 3, b, b) of the light of stars by flux, x and y, over σ."""
         # ∂(F P)/∂F = P, ∂(F P)/∂x = F ∂P/∂x, and the same by y.
-        factor = np.stack([np.ones_like(self.flux), self.flux, self.flux], axis=1)
-        return np.asarray(self._derivatives * factor[..., None, None] * self.weight[:, None])
+        flux = self.flux[rows]
+        factor = np.stack([np.ones_like(flux), flux, flux], axis=1)[..., None, None]
+        return np.asarray(self._derivatives[rows] * factor * self.weight[rows, None])
 
     def squares(self) -> np.ndarray:
         """Return the sums (m,) of the squared residuals in the boxes, in units of σ."""
@@ -291,22 +297,24 @@ class _Fit:
         return np.asarray(self.squares() + self.pull * distance_square)
 
     def solve(
-        self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray | float = 0.0
+        self, design: np.ndarray, prior: np.ndarray, damping: np.ndarray, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Gauss–Newton step (m, k) of a design (m, k, b, b), and the slope of −χ²/2."""
+        """Return the Gauss–Newton step (m, k) of some stars, and the slope of −χ²/2.
+
+        The design (m, k, b, b), and the damping (m,), are of these stars.
+        """
         from scipy.sparse import diags_array
         from scipy.sparse.linalg import splu
 
         # Levenberg's damping is a part of the diagonal, which is 1 in these units.
-        matrix, unit = _normal_matrix(design, self._rows, prior)
-        damping_diagonal = np.repeat(np.broadcast_to(damping, len(unit)), design.shape[1])
-        matrix = (matrix + diags_array(damping_diagonal)).tocsc()
+        matrix, unit = _normal_matrix(design, self._rows[rows], prior)
+        matrix = (matrix + diags_array(np.repeat(damping, design.shape[1]))).tocsc()
         # Gradient of −χ²/2: Σ over the pixels of a box of residual times derivative, over σ².
-        residual = self.weight * self.residual.ravel()[self.boxes]
+        residual = self.weight[rows] * self.residual.ravel()[self.boxes[rows]]
         gradient = np.einsum("mkrc,mrc->mk", design, residual)
         # Positions, if they are fitted, are drawn to where they are expected.
         if design.shape[1] == self.parameters:
-            gradient[:, 1:] -= self.pull * (self.position - self.prior_position)
+            gradient[:, 1:] -= self.pull * (self.position - self.prior_position)[rows]
         if not len(unit):
             return gradient, gradient
         # It is positive definite: no pivots, and an order for symmetric matrices.
@@ -322,7 +330,7 @@ class _Fit:
         `moving` stars (m,) were not at rest; x or y at the end of its range is in `bound` (m, 2).
         """
         # Standard errors, and the reduced χ² of the pixels of each box.
-        matrix, unit = _normal_matrix(self.design(), self._rows, prior)
+        matrix, unit = _normal_matrix(self.design(np.arange(len(self.stars))), self._rows, prior)
         error = standard_errors(matrix, unit)
         # The centre is fitted where noise makes the flux largest: with two free coordinates, it is
         # too large by F/S² in the mean, where S is the signal-to-noise ratio of the star alone
@@ -343,7 +351,7 @@ class _Fit:
             return column
 
         # The light of all stars is what the image has beyond the residuals.
-        core = np.s_[self.psfs.side_px : -self.psfs.side_px]
+        core = np.s_[self.border : -self.border]
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
         np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
         return JointFit(

@@ -27,6 +27,7 @@ def find_stars(
     star_positions: np.ndarray,
     threshold: float,
     fwhm_px: float,
+    changed_positions: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (n, 2), x and y, and fluxes (n,) of the stars in residuals.
 
@@ -45,6 +46,9 @@ def find_stars(
         times larger.
     fwhm_px : float
         FWHM of the PSF, px. Stars are at least half of it apart, known ones included.
+    changed_positions : ndarray, shape (k, 2), optional
+        Stars that were added to the model or dropped since the last search: only tiles that these
+        reach are searched. By default, all are.
     """
     from numpy.lib.stride_tricks import sliding_window_view
     from scipy.spatial import cKDTree
@@ -52,13 +56,24 @@ def find_stars(
     # Tiles of one PSF and one scatter. Beyond 1.5 FWHM, a PSF adds little to S.
     tile_px, half_px = max(64, 16 * int(np.ceil(fwhm_px))), int(np.ceil(1.5 * fwhm_px))
     (height, width), margin = residual.shape, half_px + 1
-    columns, peaks = np.arange(0, width, tile_px), []
-    for top in range(0, height, tile_px):
+    first_columns = np.arange(0, width, tile_px)
+    is_searched = np.ones((-(-height // tile_px), len(first_columns)), dtype=bool)
+    if changed_positions is not None:
+        # Tiles with a pixel whose S has light of a changed star.
+        reach_px = psfs.side_px // 2 + margin
+        ends = np.stack([changed_positions - reach_px, changed_positions + reach_px], axis=2)
+        is_searched[:] = False
+        for columns, rows in (np.maximum(ends, 0.0) // tile_px).astype(int):
+            is_searched[rows[0] : rows[1] + 1, columns[0] : columns[1] + 1] = True
+    peaks = [np.empty((0, 4))]
+    for top in (tile_px * np.flatnonzero(is_searched.any(axis=1))).tolist():
         # PSFs of stars in the middle of each tile of a row, at the four phases.
+        tiles = np.flatnonzero(is_searched[top // tile_px])
+        columns = first_columns[tiles]
         middle = np.stack([columns, np.full(len(columns), top)], axis=1) + tile_px // 2
         centre = (middle[:, None] + PHASES_PX).reshape(-1, 2)
         corner, faint = np.repeat(middle - half_px, 4, axis=0), np.zeros(len(centre))
-        psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)[:, 0]
+        psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)
         # The tiles with a margin of a pixel more than the PSF reaches; σ is infinite off the image.
         first, end = max(top - margin, 0), min(top + tile_px + margin, height)
         pads = (first - top + margin, top + tile_px + margin - end), (margin, margin + tile_px)
@@ -66,10 +81,10 @@ def find_stars(
             np.pad(image[first:end], pads, constant_values=outside)
             for image, outside in ((residual, 0.0), (sigma, np.inf))
         )
-        # Views of all tiles, (tiles, rows, columns), without copies.
+        # These tiles, (tiles, rows, columns).
         side = tile_px + 2 * margin
         residual_tiles, sigma_tiles = (
-            sliding_window_view(band, side, axis=1)[:, ::tile_px][:, : len(columns)].swapaxes(0, 1)
+            sliding_window_view(band, side, axis=1)[:, ::tile_px].swapaxes(0, 1)[tiles]
             for band in bands
         )
         tile_psfs = psf.reshape(len(columns), 4, *psf.shape[1:])

@@ -100,8 +100,10 @@ def measure_gain(
         # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
         # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
         corner = np.stack([column, row], axis=1) - half
-        light_and_slopes = psfs.stamps(position, corner, len(axis)).reshape(len(position), 3, -1)
-        design = np.pad(light_and_slopes, ((0, 0), (0, 1), (0, 0)), constant_values=1.0)
+        design = np.ones((len(position), 4, len(axis) ** 2))
+        stars = position, corner, len(axis)
+        design[:, 0] = psfs.stamps(*stars).reshape(len(position), -1)
+        design[:, 1:3] = psfs.slopes(*stars).reshape(len(position), 2, -1)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted_design = design / variance[..., None]

@@ -16,6 +16,7 @@ import numpy as np
 from psfdae.base.progress import steps
 from psfdae.image.sky import Sky, subtract_sky
 from psfdae.image.sky_level import add_shared_noise, measure_sky
+from psfdae.image.trails import cut_window
 from psfdae.psf.wings import Wings, compute_hats, compute_prior_profile
 from psfdae.stars.moments import label_medians
 
@@ -147,14 +148,20 @@ def draw_hats(
 
 def draw_wings(shape: tuple[int, ...], stars: StarFluxes, wings: Wings | None) -> np.ndarray:
     """Return the light of the wings of stars in an image (h, w): Σ F s Σ_k p_k h_k."""
-    # One map, to which each star adds the light in its window.
-    image, (height, width) = np.zeros(shape, np.float32), shape
+    image = np.zeros(shape, np.float32)
     if wings is not None:
-        light = (tabulate_hats(wings) @ wings.profile).astype(np.float32)
-        positions, scaled_flux = select_lit_stars(stars, wings)
-        for star, window, bins in star_bins(np.s_[0:height, 0:width], positions, wings):
-            image[window] += float(scaled_flux[star]) * np.take(light, bins, mode="clip")
+        add_wings(image, stars, wings)
     return image
+
+
+def add_wings(image: np.ndarray, stars: StarFluxes, wings: Wings, factor: float = 1.0) -> None:
+    """Add the light of the wings of stars, times a factor, to an image (h, w)."""
+    # Each star adds its light in its window, not in an image of its own.
+    light = (tabulate_hats(wings) @ wings.profile).astype(np.float32)
+    positions, scaled_flux = select_lit_stars(stars, wings)
+    height, width = image.shape
+    for star, window, bins in star_bins(np.s_[0:height, 0:width], positions, wings):
+        image[window] += factor * float(scaled_flux[star]) * np.take(light, bins, mode="clip")
 
 
 def fit_wings(
@@ -509,10 +516,9 @@ def subtract_halos(
 
     def move_wings(rows: np.ndarray, sign: float) -> None:
         """Add wings of the stars of a mask to the residual (`sign` 1), or subtract them (−1)."""
-        if rows.any():
-            light = sign * draw_wings(residual.shape, stars.select(rows), wings)
-            residual[:] += light
-            wing_light[:] -= light
+        if wings is not None and rows.any():
+            add_wings(residual, stars.select(rows), wings, sign)
+            add_wings(wing_light, stars.select(rows), wings, -sign)
 
     halo_error = np.zeros_like(residual)
     distance = np.hypot(*(stars.position[:, None] - cores[:, :2]).T)
@@ -550,14 +556,135 @@ class Halo(NamedTuple):
     error: np.ndarray
 
 
+class Rings(NamedTuple):
+    """Rings of a window around a core, those that show its halo.
+
+    Attributes
+    ----------
+    window : tuple of slice
+        Rows and columns of the pixels.
+    offset : ndarray, shape (2, h, w)
+        Rows and columns of the pixels from the middle.
+    round_offset, radius : ndarray, shape (2, h, w) and (h, w)
+        The same where ellipses are turned into circles, and the distance, px.
+    number : ndarray of int, shape (h, w)
+        Number of the ring of each pixel; 0 for the core and bad pixels.
+    halo_rings : ndarray of int, shape (k,)
+        Numbers of the rings up to the end of the halo.
+    log_radius, level, error : ndarray, shape (k,)
+        ln of the radius of each of these, the median of its pixels, and the error of that.
+    slope : float
+        Power of the distance with which the light falls off outside of them.
+    """
+
+    window: tuple[slice, ...]
+    offset: np.ndarray
+    round_offset: np.ndarray
+    radius: np.ndarray
+    number: np.ndarray
+    halo_rings: np.ndarray
+    log_radius: np.ndarray
+    level: np.ndarray
+    error: np.ndarray
+    slope: float
+
+    def draw_light(self, radius: np.ndarray) -> np.ndarray:
+        """Return the light at distances (h, w) from the middle, 0 from 256 px on."""
+        # Between rings, r³ h is linear in ln r; farther out, h is the power of the distance.
+        log_r, end = np.log(np.maximum(radius, 1.0)), self.log_radius[-1]
+        scaled_level = self.level * np.exp(3.0 * self.log_radius)
+        light = np.interp(log_r, self.log_radius, scaled_level)
+        beyond = self.slope * np.maximum(log_r - end, 0.0)
+        light *= np.exp(beyond - 3.0 * np.minimum(log_r, end))
+        light[radius >= 256.0] = 0.0
+        return np.asarray(light)
+
+
+def find_rings(
+    residual: np.ndarray,
+    bad: np.ndarray,
+    sigma: np.ndarray,
+    core: np.ndarray,
+    middle: np.ndarray,
+    to_circle: np.ndarray,
+) -> Rings | None:
+    """Find the rings that show the halo of a core, in a window as wide as they are.
+
+    Parameters are as in `measure_halo`, with the row and column of the `middle` (2,) and the matrix
+    `to_circle` (2, 2) that turns rings into circles. None if no two successive rings show a halo.
+    """
+    # Rings wider by a tenth each, in windows of which each is twice as wide as the one before.
+    edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
+    reach_px = min(256, max(64, int(4.0 * core[2])))
+    while True:
+        window = cut_window(core[1::-1], reach_px, residual.shape)
+        offset = np.mgrid[window] - middle[:, None, None]
+        round_offset = np.tensordot(to_circle, offset, 1)
+        radius = np.hypot(*round_offset)
+        ring = np.where(bad[window], 0, np.digitize(radius, edges))
+        # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
+        numbers = np.setdiff1d(np.flatnonzero(np.bincount(ring.ravel())), [0, len(edges)])
+        level = label_medians(residual[window], ring, len(edges) + 1)[numbers]
+        # The error of a median of n values is 1.25 σ/√n.
+        pixels, radius_sum, noise_sum = (
+            np.bincount(ring.ravel(), weights)[numbers]
+            for weights in (None, radius.ravel(), sigma[window].ravel())
+        )
+        log_radius, error = np.log(radius_sum / pixels), 1.25 * noise_sum / pixels**1.5
+        # The halo is the first run of rings that show it: near the core, errors of the model of a
+        # fitted star may hide it.
+        is_seen = np.append(np.abs(level) > 5.0 * error, False)
+        first = int(is_seen.argmax())
+        end = first + int(is_seen[first:].argmin())
+        # It is known as soon as a ring after it is whole, that is, its outer edge in the window.
+        is_whole = end < len(numbers) and edges[numbers[end]] < reach_px - 1
+        if is_whole or reach_px == 256 or not is_seen.any():
+            break
+        reach_px = min(2 * reach_px, 256)
+    if end - first < 2:
+        return None
+    # Noise hides the light of farther rings: it goes on along a power of the distance that fits the
+    # last four, at least r^-2.
+    last = np.s_[max(end - 4, first) : end]
+    slope = min(np.polyfit(log_radius[last], np.log(np.abs(level[last])), 1)[0], -2.0)
+    profile = numbers[:end], log_radius[:end], level[:end], error[:end], float(slope)
+    return Rings(window, offset, round_offset, radius, ring, *profile)
+
+
+def fit_shape(
+    rings: Rings, residual: np.ndarray, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the middle of rings is off, (2,), and the matrix (2, 2) that rounds them.
+
+    Residual and σ (h, w) are as in `measure_halo`.
+    """
+    data, light, radius = residual[rings.window], rings.draw_light(rings.radius), rings.radius
+    # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
+    # stretches g₁ along the axes and g₂ along the diagonals leave r h' (g₁ cos 2φ + g₂ sin 2φ).
+    # Least squares, where uneven light counts as an error of 30 %.
+    doubt = np.hypot(sigma[rings.window], 0.3 * light)
+    is_fitted = (rings.number > 0) & (np.abs(data - light) < 3.0 * doubt)
+    is_fitted &= np.log(np.maximum(radius, 1.0)) < rings.log_radius[-1]
+    slopes = np.stack(np.gradient(light))
+    along = (slopes * rings.offset).sum(axis=0) / np.maximum(radius, 1.0) ** 2  # h'/r
+    down, across = rings.round_offset
+    stretches = [-along * (down**2 - across**2), -along * 2.0 * down * across]
+    design = np.stack([*slopes, *stretches])[:, is_fitted] / doubt[is_fitted]
+    change = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
+    along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
+    stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
+    return np.clip(change[:2], -1.0, 1.0), np.array(stretch)
+
+
 def measure_halo(
     residual: np.ndarray, bad: np.ndarray, sigma: np.ndarray, core: np.ndarray
 ) -> Halo | None:
     """Measure the light that is left around a saturated core: in each ring, the median.
 
-    Rings are ellipses of one shape, which is fitted with their centre. The halo ends at the first
-    ring of which the median is below five times its error; farther out, it falls off as the power
-    of the distance that the last four rings follow, up to 256 px.
+    Rings are ellipses of one shape, which is fitted with their centre. The halo begins within 64 px
+    or four radii of the core, and ends at the first ring of which the median is below five times
+    its error; farther out, it falls off as the power of the distance that the last four rings
+    follow, up to 256 px.
 
     Parameters
     ----------
@@ -573,78 +700,30 @@ def measure_halo(
     Halo or None
         None if no two rings that follow each other show a halo.
     """
-    column, row = np.rint(core[:2]).astype(int)
-
-    def cut_window(reach_px: int) -> tuple[slice, ...]:
-        return tuple(
-            slice(max(at - reach_px, 0), min(at + reach_px + 1, size))
-            for at, size in zip((row, column), residual.shape, strict=True)
-        )
-
-    middle, window = core[1::-1].astype(float), cut_window(256)
-    # Rings wider by a tenth each; `to_circle` turns ellipses into circles.
-    edges = np.geomspace(core[2], 256.0, 8 + int(10 * np.log(256.0 / core[2])))
-    to_circle = np.eye(2)
-    for turn in range(5):
-        data, noise = residual[window], sigma[window]
-        offset = np.mgrid[window] - middle[:, None, None]
-        round_offset = np.tensordot(to_circle, offset, 1)
-        radius = np.hypot(*round_offset)
-        ring = np.where(bad[window], 0, np.digitize(radius, edges))
-        # Ring 0 is the core and bad pixels, the last one everything outside of 256 px.
-        numbers = np.setdiff1d(ring, [0, len(edges)])
-        level = label_medians(data, ring, len(edges) + 1)[numbers]
-        # The error of a median of n values is 1.25 σ/√n.
-        pixels, radius_sum, noise_sum = (
-            np.bincount(ring.ravel(), weights)[numbers]
-            for weights in (None, radius.ravel(), noise.ravel())
-        )
-        log_radius = np.log(radius_sum / pixels)
-        level_error = 1.25 * noise_sum / pixels**1.5
-        # The halo is the first run of rings that show it: near the core, errors of the model of a
-        # fitted star may hide it.
-        is_seen = np.append(np.abs(level) > 5.0 * level_error, False)
-        first = int(is_seen.argmax())
-        end_ring = first + int(is_seen[first:].argmin())
-        if end_ring - first < 2:
+    middle, to_circle = core[1::-1].astype(float), np.eye(2)
+    rings = find_rings(residual, bad, sigma, core, middle, to_circle)
+    for _ in range(4):
+        if rings is None:
             return None
-        # Noise hides the light of farther rings: it goes on along a power of the distance that fits
-        # the last four, at least r^-2. Between rings, r³ h is linear in ln r.
-        last = np.s_[max(end_ring - 4, first) : end_ring]
-        slope = min(np.polyfit(log_radius[last], np.log(np.abs(level[last])), 1)[0], -2.0)
-        log_r, end = np.log(np.maximum(radius, 1.0)), log_radius[end_ring - 1]
-        scaled_level = level[:end_ring] * np.exp(3.0 * log_radius[:end_ring])
-        height = np.interp(log_r, log_radius[:end_ring], scaled_level)
-        light = height * np.exp(slope * np.maximum(log_r - end, 0.0) - 3.0 * np.minimum(log_r, end))
-        light[radius >= 256.0] = 0.0
-        # The centre is known to half a pixel, and halos may be oval: an offset δ leaves −δ ∇h, and
-        # stretches g₁ along the axes and g₂ along the diagonals leave r h' (g₁ cos 2φ + g₂ sin 2φ).
-        # Least squares, where uneven light counts as an error of 30 %.
-        doubt = np.hypot(noise, 0.3 * light)
-        is_fitted = (ring > 0) & (log_r < end) & (np.abs(data - light) < 3.0 * doubt)
-        slopes = np.stack(np.gradient(light))
-        along = (slopes * offset).sum(axis=0) / np.maximum(radius, 1.0) ** 2  # h'/r
-        stretches = [
-            -along * (round_offset[0] ** 2 - round_offset[1] ** 2),
-            -along * 2.0 * round_offset[0] * round_offset[1],
-        ]
-        design = np.stack([*slopes, *stretches])[:, is_fitted] / doubt[is_fitted]
-        change = np.linalg.lstsq(design.T, ((light - data) / doubt)[is_fitted], rcond=None)[0]
-        middle += np.clip(change[:2], -1.0, 1.0)
-        along_axes, along_diagonals = np.clip(change[2:], -0.05, 0.05)
-        stretch = [[1.0 + along_axes, along_diagonals], [along_diagonals, 1.0 - along_axes]]
-        to_circle = stretch @ to_circle
-        # Where the halo ends is known now: its shape is fitted in a window that is twice as wide,
-        # and its light is drawn out to 256 px in the last turn.
-        window = cut_window(256 if turn >= 3 else min(256, int(2.0 * np.exp(end)) + 8))
+        move, stretch = fit_shape(rings, residual, sigma)
+        middle, to_circle = middle + move, stretch @ to_circle
+        rings = find_rings(residual, bad, sigma, core, middle, to_circle)
+    if rings is None:
+        return None
     # A halo is not an ellipse: medians in eighths of a ring scatter by more than noise does, whose
     # variance is 8 times the variance e² of the ring's median. σ² is their mean square minus 7 e²,
     # at least e². Outside of the rings that show the halo, σ is half of the light.
-    eighth = np.floor(np.arctan2(*offset) * 4.0 / np.pi).astype(int) % 8
-    uneven = label_medians(data - light, ring * 8 + eighth, 8 * len(edges) + 8).reshape(-1, 8)
-    uneven = uneven[numbers[:end_ring]]
-    noise_variance = np.square(level_error[:end_ring])
-    variance = np.nanmean(np.square(uneven), axis=1) - 7.0 * noise_variance
+    eighth = np.floor(np.arctan2(*rings.offset) * 4.0 / np.pi).astype(int) % 8
+    count = 8 * int(rings.number.max()) + 8
+    remainder = residual[rings.window] - rings.draw_light(rings.radius)
+    uneven = label_medians(remainder, rings.number * 8 + eighth, count).reshape(-1, 8)
+    noise_variance = np.square(rings.error)
+    variance = np.nanmean(np.square(uneven[rings.halo_rings]), axis=1) - 7.0 * noise_variance
     ring_error = np.sqrt(np.maximum(variance, noise_variance))
-    error = np.interp(log_r, log_radius[:end_ring], ring_error)
-    return Halo(window, light, np.where(log_r > end, 0.5 * np.abs(light), error))
+    # Light and error of all pixels up to 256 px.
+    window = cut_window(core[1::-1], 256, residual.shape)
+    offset = np.mgrid[window] - middle[:, None, None]
+    radius = np.hypot(*np.tensordot(to_circle, offset, 1))
+    light, log_r = rings.draw_light(radius), np.log(np.maximum(radius, 1.0))
+    error = np.interp(log_r, rings.log_radius, ring_error)
+    return Halo(window, light, np.where(log_r > rings.log_radius[-1], 0.5 * np.abs(light), error))

@@ -71,15 +71,26 @@ class PsfGrid:
 
     @cached_property
     def splines(self) -> np.ndarray:
-        """Coefficients (nodes, m + 4, m + 4) of the splines, mirrored by two at each edge.
+        """Coefficients (nodes, k, k) of the splines, k = m + o + 3, in single precision.
 
-        They are in single precision.
+        They are mirrored by two at each edge; o − 1 zeros follow, which stamps of `psf_px` reach.
         """
         from scipy.ndimage import spline_filter
 
         psfs = self.psfs.reshape(-1, *self.psfs.shape[-2:])
         splines = [np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs]
-        return np.stack(splines).astype(np.float32)
+        zeros = (0, self.oversampling - 1)
+        return np.pad(np.stack(splines), ((0, 0), zeros, zeros)).astype(np.float32)
+
+    @property
+    def psf_px(self) -> int:
+        """Largest number of pixels of a row or column that a PSF covers."""
+        return (self.psfs.shape[-1] - 1) // self.oversampling + 1
+
+    def find_corners(self, centre: np.ndarray) -> np.ndarray:
+        """Return column and row (n, 2) of the first pixel that the PSFs of stars (n, 2) cover."""
+        half = self.psfs.shape[-1] // 2 / self.oversampling
+        return np.ceil(centre - half).astype(int)
 
     @property
     def side_px(self) -> int:
@@ -87,7 +98,7 @@ class PsfGrid:
         return 2 * int(self.psfs.shape[-1] // 2 // self.oversampling + 1) + 1
 
     def mix_splines(self, centre: np.ndarray, flux: np.ndarray | None = None) -> np.ndarray:
-        """Return the splines (n, m + 4, m + 4) of stars at positions (n, 2), in single precision.
+        """Return the splines (n, k, k) of stars at positions (n, 2), in single precision.
 
         They are the means of the splines of the nodes around each star, and of three magnitudes if
         the grid has these; for `flux` see `stamps`.
@@ -127,7 +138,7 @@ class PsfGrid:
         flux: np.ndarray | None = None,
         splines: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the light of stars of flux 1 in stamps of the image, and its derivatives.
+        """Return the light of stars of flux 1 in stamps of the image.
 
         Parameters
         ----------
@@ -140,16 +151,49 @@ class PsfGrid:
         flux : ndarray, shape (n,), optional
             Fluxes, counts, by which the PSFs differ if the grid has magnitudes. Where they are NaN
             or not given, the PSF is as at the middle magnitude.
-        splines : ndarray, shape (n, m + 4, m + 4), optional
-            PSFs of the stars, of `mix_splines`, for stars that are drawn again after a small move.
+        splines : ndarray, shape (n, k, k), optional
+            PSFs of the stars, of `mix_splines`, for stars that are drawn several times.
 
         Returns
         -------
-        ndarray, shape (n, 3, side_px, side_px)
-            Light, and its derivatives by x and y per pixel, without the change of the PSF over the
-            field. 0 beyond the edge of the PSF.
+        ndarray, shape (n, side_px, side_px), float32
+            0 beyond the edge of the PSF.
         """
-        light = np.zeros((len(centre), 3, side_px, side_px))
+        stars = centre, corner, side_px, flux, splines
+        return self._sum_splines(*stars, with_slopes=False)[:, 0]
+
+    def slopes(
+        self,
+        centre: np.ndarray,
+        corner: np.ndarray,
+        side_px: int,
+        flux: np.ndarray | None = None,
+        splines: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the derivatives of the light of `stamps` by x and y of the star, per pixel.
+
+        Parameters are as in `stamps`; the change of the PSF over the field is left out.
+
+        Returns
+        -------
+        ndarray, shape (n, 2, side_px, side_px), float32
+            0 beyond the edge of the PSF.
+        """
+        stars = centre, corner, side_px, flux, splines
+        # A star that moves by a pixel moves by −o knots under its pixels.
+        return -self.oversampling * self._sum_splines(*stars, with_slopes=True)
+
+    def _sum_splines(
+        self,
+        centre: np.ndarray,
+        corner: np.ndarray,
+        side_px: int,
+        flux: np.ndarray | None,
+        splines: np.ndarray | None,
+        with_slopes: bool,
+    ) -> np.ndarray:
+        """Return the light (n, 1, s, s) of stars, or its slopes (n, 2, s, s) along x and y."""
+        values = np.zeros((len(centre), 2 if with_slopes else 1, side_px, side_px), np.float32)
         # Position of the first pixel among the knots, along x and y:
         # u = o (pixel − centre) + m//2, with its knot ⌊u⌋ and phase u − ⌊u⌋.
         size, between = self.psfs.shape[-1], self.oversampling
@@ -159,45 +203,47 @@ class PsfGrid:
         is_inside = (pixel_knot >= 0) & (pixel_knot + (first > knot)[..., None] <= size - 1)
         # Stamps with at least one pixel within the PSF; all others stay 0.
         stars = np.flatnonzero(is_inside.any(axis=2).all(axis=1))
-        weights, slopes = (kernel.astype(np.float32) for kernel in knot_weights(first - knot))
+        # Weights of the four taps of a pixel along y and x, of which one may be the slope.
+        (x, y), (x_slope, y_slope) = (
+            kernel.astype(np.float32).swapaxes(0, 1) for kernel in knot_weights(first - knot)
+        )
+        pairs = [(y, x_slope), (y_slope, x)] if with_slopes else [(y, x)]
         # Stamps may reach beyond a PSF: pad its spline with zeros, by no more than they do. Four
         # coefficients from the knot before the first pixel on are its taps.
         begin, span = knot[stars] + 1, between * (side_px - 1) + 4
         end = self.splines.shape[-1]
         room = max(0, -begin.min(initial=0), begin.max(initial=0) + span - end)
-        # Batches, for memory: a pixel needs 16 coefficients.
-        for batch in np.array_split(stars, len(stars) * side_px**2 // 2**17 + 1):
+        # Batches of a quarter of a megabyte, which stay in the processor's cache.
+        for batch in np.array_split(stars, len(stars) * 4 * side_px * span // 2**16 + 1):
             if splines is None:
-                mean_spline = self.mix_splines(centre[batch], None if flux is None else flux[batch])
+                part = self.mix_splines(centre[batch], None if flux is None else flux[batch])
+                spline = np.arange(len(batch))
             else:
-                mean_spline = splines[batch]
-            mean_spline = np.pad(mean_spline, ((0, 0), *[(room, room)] * 2))
-            # View of the 4 × 4 taps of all pixels of a stamp that begins at any coefficient:
-            # pixels are o coefficients apart.
-            star_step, down, across = mean_spline.strides
+                part, spline = splines, batch
+            if room:
+                part, spline = part[spline], np.arange(len(batch))
+                part = np.pad(part, ((0, 0), (room, room), (room, room)))
+            # View of the four taps along y of all rows of pixels, for stamps that begin at any
+            # coefficient: pixels are o coefficients apart.
+            star_step, down, across = part.strides
             taps = np.lib.stride_tricks.as_strided(
-                mean_spline,
-                (len(mean_spline), *[end + 2 * room - span + 1] * 2, 4, 4, side_px, side_px),
-                (star_step, down, across, down, across, between * down, between * across),
+                part,
+                (len(part), *[end + 2 * room - span + 1] * 2, 4, side_px, span),
+                (star_step, down, across, down, between * down, across),
                 writeable=False,
             )
             column, row = knot[batch].T + room + 1
-            taps = taps[np.arange(len(batch)), row, column].reshape(len(batch), 16, side_px**2)
-            # Σ over the taps: light, ∂/∂x with the slopes along x, ∂/∂y with those along y.
-            (x, y), (x_slope, y_slope) = (a[batch].swapaxes(0, 1) for a in (weights, slopes))
-            kernels = np.stack(
-                [
-                    y[:, :, None] * x[:, None],
-                    y[:, :, None] * x_slope[:, None],
-                    y_slope[:, :, None] * x[:, None],
-                ],
-                axis=1,
-            ).reshape(len(batch), 3, 16)
-            light[batch] = (kernels @ taps).reshape(len(batch), 3, side_px, side_px)
-        # A star that moves by a pixel moves by −o knots under its pixels.
-        light[:, 1:] *= -between
-        light *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
-        return light
+            taps = taps[spline, row, column].reshape(len(batch), 4, side_px * span)
+            # Sums over these taps, for all coefficients of a row, and then over those along x.
+            for number, (down_weight, across_weight) in enumerate(pairs):
+                sums = (down_weight[batch, None] @ taps).reshape(-1, side_px, span)
+                values[batch, number] = sum(
+                    across_weight[batch, tap, None, None]
+                    * sums[:, :, tap : tap + span - 3 : between]
+                    for tap in range(4)
+                )
+        values *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
+        return values
 
     def _nodes(self, centre: np.ndarray, flux: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (n, 4 or 12) of the nodes around each star, and their weights."""

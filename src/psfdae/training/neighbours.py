@@ -173,7 +173,7 @@ def draw_other_stars(
         fitted_rows = np.flatnonzero(distance[rows] <= 1.5)
         star = star_rows[nearest[rows][fitted_rows]]
         corner = np.rint(list_positions[rows][fitted_rows]).astype(int) - stamp_px // 2 - margin
-        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1], flux[star])[:, 0]
+        star_light = psfs.stamps(centre[star], corner, stamps.shape[-1], flux[star])
         stamps[fitted_rows] -= flux[star, None, None] * star_light
         return stamps
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial import cKDTree
 
 import psfdae
@@ -22,6 +23,7 @@ from psfdae.image.sky import sky_around, subtract_sky
 from psfdae.image.sky_level import (
     SkyStructure,
     _smooth_meshes,
+    _to_pixels,
     measure_meshes,
     noise_correlation,
     sky_level,
@@ -338,6 +340,17 @@ def test_constant_squares_are_found_anywhere(shift):
         is_constant = bad_pixels.find_constant_squares(np.where(flat, 5.0, values))
         assert is_constant.any() and (is_constant <= flat).all()
         assert (is_constant == flat)[8:].all() and is_constant[area][:4, 8:].all()
+
+
+def test_a_sky_between_meshes_is_a_cubic_spline_through_them():
+    """As scipy interpolates it, away from the edges; whole meshes and parts of one."""
+    mesh = np.random.default_rng(4).normal(size=(12, 14))
+    level = _to_pixels(mesh, (360, 410), 32, 1.0)
+    row, column = ((np.arange(n) + 0.5) / 32 - 0.5 for n in level.shape)
+    expected = RectBivariateSpline(np.arange(12), np.arange(14), mesh)(row, column)
+    inner = np.s_[130:-130, 130:-130]
+    assert level[inner] == pytest.approx(expected[inner], abs=0.05)
+    assert np.ptp(expected[inner]) > 1.0
 
 
 def test_a_mesh_far_from_the_plane_of_its_neighbours_takes_their_value():

@@ -9,7 +9,6 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import csc_array
 
-from psfdae.photometry import joint_fit
 from psfdae.photometry.joint_fit import _normal_matrix, chains, fit_stars, standard_errors
 from psfdae.psf.grid import PsfGrid
 from psfdae.stars.bright_stars import magnitude
@@ -30,7 +29,7 @@ def image_of(psfs, place, flux, size=120):
     side = psfs.side_px
     image = np.zeros((size + 2 * side,) * 2)
     corner = np.rint(place).astype(int) - side // 2
-    stamp = psfs.stamps(place, corner, side)[:, 0]
+    stamp = psfs.stamps(place, corner, side)
     for (x, y), light in zip(corner + side, flux[:, None, None] * stamp, strict=True):
         image[y : y + side, x : x + side] += light
     return image[side:-side, side:-side]
@@ -47,7 +46,7 @@ def test_psfs_change_with_the_magnitude_as_a_parabola(psfs):
     )
     place, corner = np.full((4, 2), 30.2), np.full((4, 2), 27)
     flux = np.append(1e4 * 10.0 ** (-0.8 * np.array([-2.0, 0.4, 2.0])), np.nan)
-    ratio = grid.stamps(place, corner, 7, flux)[:, 0] / psfs.stamps(place, corner, 7)[:, 0]
+    ratio = grid.stamps(place, corner, 7, flux) / psfs.stamps(place, corner, 7)
     expected = np.array([0.7, 1.064, 1.1, 1.0])[:, None, None]
     assert ratio == pytest.approx(expected * np.ones((4, 7, 7)), rel=1e-6)
 
@@ -68,23 +67,34 @@ def test_stars_that_overlap_are_parted_exactly(psfs, unit):
     assert fit.light == pytest.approx(image, abs=unit)
 
 
-@pytest.mark.parametrize("has_magnitudes", [False, True])
-def test_a_fit_does_not_depend_on_the_psfs_that_memory_holds(psfs, has_magnitudes, monkeypatch):
-    """PSFs of many stars in wide stamps are made again when they are drawn."""
-    grid = psfs
-    if has_magnitudes:
-        layers = np.array([1.0, 1.1, 1.3])[:, None, None, None, None]
-        grid = replace(psfs, psfs=layers * psfs.psfs, magnitudes=np.array([-10.0, -9.0, -8.0]))
-    rng = np.random.default_rng(2)
-    place, flux = rng.uniform(5, 114, (30, 2)), 10 ** rng.uniform(3, 4, 30)
+def test_a_star_is_fitted_as_if_others_far_away_were_not(psfs):
+    """A close pair that takes all steps, a star at rest after few, and both in one image."""
+    place = np.array([[30.0, 30.0], [30.9, 30.0], [80.3, 80.4]])
+    flux = np.array([300.0, 200.0, 1e5])
     image = image_of(psfs, place, flux)
-    start = place + rng.uniform(-0.5, 0.5, place.shape)
-    pixels = image, np.ones(image.shape), np.zeros(image.shape, bool)
-    kept = fit_stars(grid, *pixels, start, None, BOX_PX, FWHM_PX)
-    monkeypatch.setattr(joint_fit, "MOST_SPLINE_BYTES", 0)
-    fit = fit_stars(grid, *pixels, start, None, BOX_PX, FWHM_PX)
-    for name, values in vars(kept).items():
-        np.testing.assert_array_equal(values, getattr(fit, name), err_msg=name)
+    image += np.random.default_rng(3).normal(0, 3.0, image.shape)
+    start = place + np.array([[-0.6, 0.8], [0.9, -0.7], [0.5, 0.4]])
+    pixels = image, np.full(image.shape, 3.0), np.zeros(image.shape, bool)
+    fit = fit_stars(psfs, *pixels, start, None, BOX_PX, FWHM_PX)
+    for rows in ([0, 1], [2]):
+        alone = fit_stars(psfs, *pixels, start[rows], None, BOX_PX, FWHM_PX)
+        for name in ("position", "position_error", "flux", "flux_error", "flux_bias"):
+            assert getattr(fit, name)[rows] == pytest.approx(getattr(alone, name), rel=1e-5)
+        assert fit.flags[rows].tolist() == alone.flags.tolist()
+
+
+@pytest.mark.parametrize("column", [60.0, 118.6])
+def test_the_light_of_a_star_far_from_where_it_was_expected_is_whole(psfs, column):
+    """2.5 px: its stamp moves with it, also at the edge of the image."""
+    place, flux = np.array([[column, 40.0]]), np.array([1e4])
+    image = image_of(psfs, place, flux)
+    error, bad = np.ones(image.shape), np.zeros(image.shape, bool)
+    fit = fit_stars(psfs, image, error, bad, place - [2.5, 0.0], None, 9, 4.0)
+    assert fit.position == pytest.approx(place, abs=1e-3)
+    assert fit.light == pytest.approx(image, abs=1e-3 * image.max())
+    # The corners of the stamp, too, where the light is below that.
+    far = np.abs(np.indices(image.shape)[1] - column) > 6
+    assert fit.light[far].sum() == pytest.approx(image[far].sum(), rel=0.05)
 
 
 def test_errors_are_those_of_the_noise(psfs):

@@ -35,7 +35,7 @@ def lit(grid, place, flux, shape=(SIZE, SIZE)):
     light = np.zeros((shape[0] + 40, shape[1] + 40))
     corner = np.rint(place).astype(int) - 10
     for (column, row), f, star in zip(corner, flux, grid.stamps(place, corner, 21), strict=True):
-        light[row + 20 : row + 41, column + 20 : column + 41] += f * star[0]
+        light[row + 20 : row + 41, column + 20 : column + 41] += f * star
     return light[20:-20, 20:-20]
 
 
@@ -55,10 +55,10 @@ def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
     residual = rng.normal(0, sigma) + lit(grid, np.array([phase]) + 15, [50.0], (31, 31))
     corner = np.array([[9, 9]])
     phases = 15 + 0.5 * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
-    psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)[:, 0]
+    psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)
     # Most of the scatter is below 1 by a factor: the noise is that of σ.
     (snr,), (flux,) = measure_snr(residual[None], sigma[None], psf[None])
-    star = grid.stamps(np.array([phase]) + 15, corner, 13)[0, 0]
+    star = grid.stamps(np.array([phase]) + 15, corner, 13)[0]
     weight = sigma[9:22, 9:22] ** -2.0
     information = (star**2 * weight).sum()
     expected = (star * residual[9:22, 9:22] * weight).sum() / information
@@ -79,13 +79,30 @@ def test_nothing_is_found_in_the_light_of_a_star_of_any_brightness(flux):
     assert found_flux == pytest.approx([60.0], rel=0.3)
 
 
+@pytest.mark.parametrize("place", [(130.0, 61.0), (4.0, 178.0)])
+def test_a_search_near_a_star_that_changed_finds_what_a_search_of_all_finds_there(scattered, place):
+    """Also at the edge of a tile of 64 px, or of the image."""
+    grid, place = gaussian_grid(3.2), np.array([place])
+    image = np.random.default_rng(2).normal(0, 1, (SIZE, SIZE))
+    image += lit(grid, scattered, np.full(len(scattered), 50.0))
+    maps = image, np.ones(image.shape), NOBODY, 4.0, 3.2
+    everywhere, flux = find_stars(grid, *maps)
+    nearby, nearby_flux = find_stars(grid, *maps, place)
+    rows = cKDTree(everywhere).query(nearby)[1]
+    assert (nearby == everywhere[rows]).all() and (nearby_flux == flux[rows]).all()
+    is_near = np.abs(everywhere - place).max(axis=1) < grid.side_px // 2
+    assert is_near.sum() >= 1 and set(np.flatnonzero(is_near)) <= set(rows)
+    assert np.abs(nearby - place).max() < 64 + 2 * grid.side_px
+    assert not len(find_stars(grid, *maps, np.empty((0, 2)))[0])
+
+
 @pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
 @pytest.mark.parametrize("fwhm", [1.6, 3.2, 8.0])
 def test_faint_stars_are_found_and_few_peaks_of_noise(scattered, unit, fwhm):
     """Nearly all stars of S/N 7 are found, with positions and fluxes, in all units of a sky."""
     rng, grid = np.random.default_rng(2), gaussian_grid(fwhm, side=32 if fwhm > 5 else 16)
     flux = 7.0 / np.sqrt(
-        np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0, 0]).sum()
+        np.square(grid.stamps(np.zeros((1, 2)), np.array([[-16, -16]]), 33)[0]).sum()
     )
     scattered = scattered[:: 1 if fwhm < 5 else 7]  # far enough from each other
     light = lit(grid, scattered, np.full(len(scattered), flux))
