@@ -135,17 +135,6 @@ def test_there_are_as_many_stars_as_are_true(sky, phot):
     assert abs(np.median(phot.residual)) < 0.5
 
 
-def test_two_fits_have_the_stars_that_one_leaves_and_the_same_wings(sky, phot):
-    """A training needs no more: stars near others are found after the first fit."""
-    folder, path, true = sky
-    observation = open_observation(ImageInput(folder / "i.fits", detect=5.0), STAMP)
-    two_fits = crowded.photometry(load_model(path), observation, 5.0, turns=2)
-    assert observation.count < 0.97 * len(true)
-    assert len(two_fits.stars) == pytest.approx(len(true), abs=0.02 * len(true))
-    light, error = phot.image_wings.light()
-    assert two_fits.image_wings.light()[0] == pytest.approx(light, abs=0.3 * error)
-
-
 def test_aperture_corrections(phot):
     for x, y in ((100.0, 100.3), (290.4, 150.0)):
         image = stamps(np.array([x]), np.array([y]))[0]
