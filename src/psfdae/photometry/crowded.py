@@ -161,8 +161,7 @@ def photometry(
     wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.signal, gain)
-    # Positions of all stars that were found in residuals: each is tried once. In the third search
-    # and later ones, sky and errors are known: only stars that change show others.
+    # Positions of all stars that were found in residuals, each is tried once, and of the last ones.
     peaks, new = np.empty((0, 2)), np.empty((0, 2))
     # Positions by the list, and their error, as soon as its bright stars have shown it.
     is_listed, position_prior = observation.detections is None, None
@@ -207,12 +206,13 @@ def photometry(
         # Stars that were found in residuals are dropped if they are none.
         doubt = _psf_doubt(position, flux, side, area_px)
         is_real = find_real(position, fit, doubt, observation.count, threshold, 0.5 * fwhm)
-        dropped, position, flux, origin = (
-            position[~is_real],
+        changed, position, flux, origin = (
+            np.concatenate([new, position[~is_real]]),
             *(values[is_real] for values in (position, flux, origin)),
         )
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
-        # stars and find none; of two fits, none drops any.
+        # stars and find none; of two fits, none drops any. From the third search on, sky and errors
+        # stay as they are if few stars change: only these can show others.
         if not is_listed and turn < max(turns - 2, 1):
             sigma = np.where(bad, np.inf, add_model_errors(error, fit.light, wing_light))
             new, new_flux = find_stars(
@@ -222,7 +222,7 @@ def photometry(
                 np.concatenate([position, peaks]),
                 threshold,
                 fwhm,
-                np.concatenate([new, dropped]) if turn > 1 else None,
+                changed if turn > 1 and len(changed) < 0.05 * len(position) else None,
             )
             position, origin, peaks = (np.concatenate([p, new]) for p in (position, origin, peaks))
             flux = np.append(flux, new_flux)

@@ -149,8 +149,11 @@ def measure_snr(
     # The error of a sum is 1e-7 of the largest one: in the light of a star of 10⁵ σ, whose model's
     # error makes σ 10³ times as large, nothing can be found.
     is_known = information > 1e-6 * information.max(axis=(1, 2, 3), keepdims=True)
-    if not is_used.all():
-        is_known &= correlate(is_used, kernels[1]) > 0.5 * square.sum(axis=(2, 3), keepdims=True)
+    # Only parts with bad pixels, or at an edge, can lack half of Σ P².
+    parts = np.flatnonzero(~is_used.all(axis=(1, 2)))
+    if parts.size:
+        total = square[parts].sum(axis=(2, 3), keepdims=True)
+        is_known[parts] &= correlate(is_used[parts], kernels[1][parts]) > 0.5 * total
     root = np.sqrt(np.where(is_known, information, np.inf))
     snr = projection / root
     flux = snr / root
@@ -162,7 +165,7 @@ def measure_snr(
     scatter = SIGMA_OF_MAD * modulus[np.arange(len(snr)), np.maximum(count - 1, 0) // 2]
     snr /= np.where(count > 0, np.maximum(scatter, 1.0), 1.0)[:, None, None, None]
     # The four phases of a pixel are its four half pixels.
-    parts, _, height, width = snr.shape
-    values = np.stack([snr, flux]).reshape(2, parts, 2, 2, height, width)
-    snr, flux = values.transpose(0, 1, 4, 2, 5, 3).reshape(2, parts, 2 * height, 2 * width)
+    tiles, _, height, width = snr.shape
+    values = np.stack([snr, flux]).reshape(2, tiles, 2, 2, height, width)
+    snr, flux = values.transpose(0, 1, 4, 2, 5, 3).reshape(2, tiles, 2 * height, 2 * width)
     return snr, flux

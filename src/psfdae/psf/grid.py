@@ -85,12 +85,12 @@ class PsfGrid:
     @property
     def psf_px(self) -> int:
         """Largest number of pixels of a row or column that a PSF covers."""
-        return (self.psfs.shape[-1] - 1) // self.oversampling + 1
+        return int((self.psfs.shape[-1] - 1) // self.oversampling + 1)
 
     def find_corners(self, centre: np.ndarray) -> np.ndarray:
         """Return column and row (n, 2) of the first pixel that the PSFs of stars (n, 2) cover."""
         half = self.psfs.shape[-1] // 2 / self.oversampling
-        return np.ceil(centre - half).astype(int)
+        return np.asarray(np.ceil(centre - half).astype(int))
 
     @property
     def side_px(self) -> int:
