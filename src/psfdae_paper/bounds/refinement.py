@@ -429,7 +429,7 @@ class Refiner:
         images = monomial_images(pupil.axis, pupil.axis[:, None]).reshape(len(MONOMIALS), -1)
         light = pupil.amplitude.ravel() / pupil.amplitude.sum()
         deviation = images - (images @ light)[:, None]
-        return np.linalg.cholesky((light * deviation) @ deviation.T)
+        return np.asarray(np.linalg.cholesky((light * deviation) @ deviation.T))
 
     def find_distinct(self, star: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return False for wavefronts (n, 8) that an earlier one of the same star is near, (n,)."""
@@ -493,24 +493,28 @@ class Refiner:
         return stars[has_mass], replace(expansion, components=owned).select(has_mass)
 
     def assign(self, star: np.ndarray, expansion: Expansion) -> tuple[Components, np.ndarray]:
-        """Give every component to the nearest expansion point of its star.
+        """Give every component to an expansion whose point is near its mean, and to no other.
 
         Returns
         -------
         owned : Components
-            Components, of mass 0 where the mean is nearer to another point than to the own one.
+            Components, of mass 0 where they belong to another expansion.
         distance : ndarray, shape (n, 4 f)
             Distance of the means from the own points, in waves.
         """
         shift, log_mass = expansion.components.shift, expansion.components.log_mass.copy()
-        distance = np.linalg.norm(shift @ self.root, axis=2)
-        scaled = expansion.point @ self.root
+        square, scaled = np.square(shift @ self.root).sum(axis=2), expansion.point @ self.root
         for partner in list_partners(star):
-            # |δ + g|² < |δ|² for the gap g from the partner's point to the own one.
+            # |δ + g|² of the gap g from the partner's point to the own one.
             gap = scaled - scaled[partner]
             excess = 2.0 * (shift @ (gap @ self.root.T)[:, :, None])[:, :, 0]
-            log_mass[excess < -np.square(gap).sum(axis=1, keepdims=True)] = -np.inf
-        return replace(expansion.components, log_mass=log_mass), distance
+            excess += np.square(gap).sum(axis=1, keepdims=True)
+            # A component that two expansions leave to each other would be lost: a later one takes
+            # all that is nearer to it, an earlier one what is close to it.
+            is_earlier = (partner < np.arange(len(star)))[:, None]
+            is_close = square + excess < (0.5 * self.linear_waves) ** 2
+            log_mass[np.where(is_earlier, is_close, excess < 0.0)] = -np.inf
+        return replace(expansion.components, log_mass=log_mass), np.sqrt(square)
 
     def begin(
         self, point: np.ndarray, damping: np.ndarray, counts: np.ndarray, flux: np.ndarray
