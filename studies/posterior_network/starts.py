@@ -50,7 +50,7 @@ def main():
             proposals = start[:, None], precision, np.ones((STARS, 1))
             anything = NetworkStarts(*proposals, stars.stamps, np.full(stars.stamps.shape, np.inf))
             for expansions in (2, 3):
-                Refiner.max_steps, Refiner.min_gain = expansions, 0.0
+                Refiner.max_steps, Refiner.linear_waves = expansions, 0.0
                 refined = Refiner(prior, *optics).refine(noisy, level, anything)
                 error = np.square(refined.psf - stars.stamps).mean(axis=1)
                 values = error.mean(), np.median(error), refined.variance.mean()

@@ -12,7 +12,7 @@ import numpy as np
 class Rows:
     """Base of dataclasses whose fields have a row for each item.
 
-    A field is an array, and for `select` and `split` may also be another such object, or None.
+    A field is an array or another such object; for `select` and `split` it may be None.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -38,7 +38,13 @@ class Rows:
         if len(parts) == 1:
             return parts[0]
         columns = ([getattr(part, field.name) for part in parts] for field in fields(cls))
-        return cls(*map(np.concatenate, columns))
+        return cls(*map(_join, columns))
+
+
+def _join(columns: list[Any]) -> Any:
+    """Return arrays or `Rows` one after the other."""
+    first = columns[0]
+    return type(first).join(columns) if isinstance(first, Rows) else np.concatenate(columns)
 
 
 def _select(column: Any, rows: np.ndarray | slice) -> Any:

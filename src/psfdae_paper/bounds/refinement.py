@@ -13,22 +13,27 @@ c = s_fo + D_fᵀ z with z ~ N(0, 1). Product and integral are Gaussians: with e
     A = D M Dᵀ + 1,   b = D (g − M e),   ⟨z⟩ = A⁻¹ b,   cov z = A⁻¹,
     ln mass = gᵀe − ½ eᵀMe + ½ bᵀA⁻¹b − ½ ln |A|.
 
-The expansion point moves to the most likely of these, and the stamp is computed anew. In the end
-the sums over all fields and offsets give the posterior mean ⟨p⟩ ≈ p + ⟨δ⟩ᵀ∂p and its variance.
+A Gaussian is used near its expansion point only. Where much of the mass is far from all points of a
+star, the stamp is computed anew there: this climbs to a mode, and finds other wavefronts that give
+nearly the same image. A Gaussian belongs to the nearest point, so that no mass is counted twice. In
+the end the sums over all fields, offsets and points give the posterior mean ⟨p⟩ ≈ p + ⟨δ⟩ᵀ∂p, and
+its variance.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from psfdae.base.rows import Rows
 from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
-from psfdae.optics.pupil import choose_samples
+from psfdae.optics.pupil import annular_pupil, choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
-from psfdae.sensing.climbing import poisson_information
+from psfdae.sensing.climbing import group_maximum, poisson_information
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.bounds.posterior_network import (
     PosteriorNetwork,
@@ -111,7 +116,8 @@ class SeidelPrior:
         return Components(log_mass.reshape(count, -1), shift, field_covariance)
 
 
-class Components(NamedTuple):
+@dataclass(frozen=True)
+class Components(Rows):
     """Posterior of each star as a mixture of Gaussians of δ, over f fields and four offsets.
 
     Attributes
@@ -171,7 +177,7 @@ def invert(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Expansion:
+class Expansion(Rows):
     """Stamps of wavefronts, the likelihood of photons about them, and the posterior.
 
     Attributes
@@ -182,8 +188,6 @@ class Expansion:
         Stamps of sum 1, and their derivatives by c.
     deviance : ndarray, shape (n,)
         −2 ln L(c⁰), relative to the counts themselves.
-    information : ndarray, shape (n, 8, 8)
-        Fisher information M.
     components : Components
         Posterior of δ.
     """
@@ -192,7 +196,6 @@ class Expansion:
     stamps: np.ndarray
     slopes: np.ndarray
     deviance: np.ndarray
-    information: np.ndarray
     components: Components
 
     @property
@@ -200,20 +203,12 @@ class Expansion:
         """Logarithm of the integral of prior × likelihood, (n,)."""
         return np.asarray(self.components.evidence - 0.5 * self.deviance)
 
-    @property
-    def gain(self) -> np.ndarray:
-        """Gain ½ δᵀMδ of a step to the most likely component, (n,)."""
-        shift = self.components.mode
-        return np.asarray(0.5 * np.einsum("na,nab,nb->n", shift, self.information, shift))
-
-    def moments(self, stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return posterior mean and variance of the stamps of some stars, (m, P) both."""
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return posterior mean and variance of the stamps, (n, P) both."""
         # ⟨p⟩ = p + ⟨δ⟩ᵀ∂p and var p = ∂pᵀ cov(δ) ∂p.
-        components = Components(*(values[stars] for values in self.components))
-        mean, covariance = components.moments()
-        slopes = self.slopes[stars]
-        psf = self.stamps[stars] + (mean[:, None] @ slopes)[:, 0]
-        return psf, ((covariance @ slopes) * slopes).sum(axis=1)
+        mean, covariance = self.components.moments()
+        psf = self.stamps + (mean[:, None] @ self.slopes)[:, 0]
+        return psf, ((covariance @ self.slopes) * self.slopes).sum(axis=1)
 
 
 class NetworkStarts(NamedTuple):
@@ -292,11 +287,15 @@ class Refiner:
     noise : NoiseModel
         Photon noise of the images.
     max_steps : int
-        Maximum number of expansions of a climb, at least two.
+        Maximum number of successive expansions, at least two.
     damping : float
         Factor of the inverse covariances of starts, by which the first step is damped.
-    min_gain : float
-        A climb ends where the next step would raise the logarithm of the posterior by less.
+    linear_waves : float
+        RMS of the difference of two wavefronts in waves, up to which an expansion about one of them
+        is used at the other.
+    min_far_mass : float
+        Part of a star's mass that is farther from all expansion points, above which another
+        expansion is made.
     max_proposals : int
         Maximum number of proposals that are tried.
     min_weight : float
@@ -314,8 +313,9 @@ class Refiner:
     obscuration: float
     stamp_px: int
     noise: NoiseModel
-    max_steps: ClassVar[int] = 3
-    min_gain: ClassVar[float] = 1.0
+    max_steps: ClassVar[int] = 4
+    linear_waves: ClassVar[float] = 0.1
+    min_far_mass: ClassVar[float] = 0.05
     damping: ClassVar[float] = 0.25
     max_proposals: ClassVar[int] = 8
     min_weight: ClassVar[float] = 0.05
@@ -383,7 +383,7 @@ class Refiner:
             flux[:, None, None] * slopes,
         )
         components = self.prior.condition(point, score, information + damping, fields)
-        return Expansion(point, stamps, slopes, deviance, information, components)
+        return Expansion(point, stamps, slopes, deviance, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
         """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
@@ -405,18 +405,116 @@ class Refiner:
             star, number = np.nonzero(is_likely[first : first + self.batch])
             star += first
             start = starts.points[star, number], self.damping * starts.precision[star, number]
-            first_evidence, point, fields = self.begin(*start, counts[star], flux[star])
-            best_evidence = np.full(count, -np.inf)
-            np.maximum.at(best_evidence, star, first_evidence)
-            is_near = first_evidence >= best_evidence[star] - self.max_gap
-            star = star[is_near]
-            peaks = self.climb(point[is_near], fields[is_near], counts[star], flux[star])
+            first_evidence, point, likely_fields = self.begin(*start, counts[star], flux[star])
+            # Near the best start of a star no other one is needed, nor with much less evidence.
+            order = np.lexsort((-first_evidence, star))
+            star, point, likely_fields = star[order], point[order], likely_fields[order]
+            gap = group_maximum(first_evidence[order], star) - first_evidence[order]
+            is_used = self.find_distinct(star, point) & (gap <= self.max_gap)
+            starting = star[is_used], point[is_used], likely_fields[is_used]
+            star, expansion = self.follow(*starting, counts, flux)
             # Means over the wavefronts of a star, with their posterior probabilities.
-            np.logaddexp.at(evidence, star, peaks.evidence)
-            weight = np.exp(peaks.evidence - evidence[star])[:, None]
-            np.add.at(psf, star, weight * peaks.psf)
-            np.add.at(variance, star, weight * (peaks.variance + (peaks.psf - psf[star]) ** 2))
+            np.logaddexp.at(evidence, star, expansion.evidence)
+            weight = np.exp(expansion.evidence - evidence[star])[:, None]
+            mean, scatter = expansion.moments()
+            np.add.at(psf, star, weight * mean)
+            np.add.at(variance, star, weight * (scatter + (mean - psf[star]) ** 2))
         return RefinedPsfs(psf, variance, evidence)
+
+    @cached_property
+    def root(self) -> np.ndarray:
+        """Matrix R, (8, 8): |c R| is the RMS in waves of the wavefront of coefficients c."""
+        # Covariances of the monomials over the pupil: piston changes no image.
+        pupil = annular_pupil(64, self.obscuration)
+        images = monomial_images(pupil.axis, pupil.axis[:, None]).reshape(len(MONOMIALS), -1)
+        light = pupil.amplitude.ravel() / pupil.amplitude.sum()
+        deviation = images - (images @ light)[:, None]
+        return np.asarray(np.linalg.cholesky((light * deviation) @ deviation.T))
+
+    def find_distinct(self, star: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Return False for wavefronts (n, 8) that an earlier one of the same star is near, (n,)."""
+        scaled, is_distinct = point @ self.root, np.ones(len(star), bool)
+        for partner in list_partners(star):
+            distance = np.linalg.norm(scaled[partner] - scaled, axis=1)
+            is_distinct &= (partner >= np.arange(len(star))) | (distance > self.linear_waves)
+        return is_distinct
+
+    def follow(
+        self,
+        star: np.ndarray,
+        point: np.ndarray,
+        likely_fields: np.ndarray,
+        counts: np.ndarray,
+        flux: np.ndarray,
+    ) -> tuple[np.ndarray, Expansion]:
+        """Expand posteriors about wavefronts, and where these expansions find other wavefronts.
+
+        Parameters
+        ----------
+        star : ndarray of int, shape (n,)
+            Stars of the wavefronts.
+        point, likely_fields : ndarray, shapes (n, 8) and (n, f)
+            Results of `begin`.
+        counts, flux : ndarray, shapes (N, P) and (N,)
+            Photons of all stars; see `begin`.
+
+        Returns
+        -------
+        star : ndarray of int, shape (m,)
+            Stars of the expansions.
+        expansion : Expansion
+            Expansions with the components that belong to them.
+        """
+        stars, every_field = star, likely_fields
+        expansion = self.expand(point, counts[star], flux[star], likely_fields)
+        for _ in range(2, self.max_steps):
+            owned, distance = self.assign(stars, expansion)
+            # Mass of the components that are far from all expansion points.
+            log_mass = owned.log_mass - 0.5 * expansion.deviance[:, None]
+            far_log_mass = np.where(distance > self.linear_waves, log_mass, -np.inf)
+            total, far = np.full((2, len(counts)), -np.inf)
+            np.logaddexp.at(total, stars, np.logaddexp.reduce(log_mass, axis=1))
+            np.logaddexp.at(far, stars, np.logaddexp.reduce(far_log_mass, axis=1))
+            # The next point of a star is the largest of them.
+            largest = far_log_mass.max(axis=1)
+            is_next = (largest == group_maximum(largest, stars)) & (largest > -np.inf)
+            is_next &= far[stars] > total[stars] + np.log(self.min_far_mass)
+            if not is_next.any():
+                break
+            star, likely_fields = stars[is_next], every_field[is_next]
+            rows, component = np.flatnonzero(is_next), far_log_mass[is_next].argmax(axis=1)
+            point = expansion.point[rows] + expansion.components.shift[rows, component]
+            new = self.expand(point, counts[star], flux[star], likely_fields)
+            stars, expansion = np.concatenate([stars, star]), Expansion.join([expansion, new])
+            every_field = np.concatenate([every_field, likely_fields])
+        owned, _ = self.assign(stars, expansion)
+        # Other points may have all components of an expansion.
+        has_mass = np.isfinite(owned.log_mass).any(axis=1)
+        return stars[has_mass], replace(expansion, components=owned).select(has_mass)
+
+    def assign(self, star: np.ndarray, expansion: Expansion) -> tuple[Components, np.ndarray]:
+        """Give every component to an expansion whose point is near its mean, and to no other.
+
+        Returns
+        -------
+        owned : Components
+            Components, of mass 0 where they belong to another expansion.
+        distance : ndarray, shape (n, 4 f)
+            Distance of the means from the own points, in waves.
+        """
+        shift, log_mass = expansion.components.shift, expansion.components.log_mass.copy()
+        square, scaled = np.square(shift @ self.root).sum(axis=2), expansion.point @ self.root
+        for partner in list_partners(star):
+            # |δ + g|² of the gap g from the partner's point to the own one.
+            gap = scaled - scaled[partner]
+            excess = 2.0 * (shift @ (gap @ self.root.T)[:, :, None])[:, :, 0]
+            excess += np.square(gap).sum(axis=1, keepdims=True)
+            # A component that two expansions leave to each other would be lost: a later one takes
+            # all that is nearer to it, an earlier one what is close to it.
+            is_earlier = (partner < np.arange(len(star)))[:, None]
+            is_close = square + excess < (0.5 * self.linear_waves) ** 2
+            log_mass[np.where(is_earlier, is_close, excess < 0.0)] = -np.inf
+        return replace(expansion.components, log_mass=log_mass), np.sqrt(square)
 
     def begin(
         self, point: np.ndarray, damping: np.ndarray, counts: np.ndarray, flux: np.ndarray
@@ -451,26 +549,22 @@ class Refiner:
         likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
         return expansion.evidence, point + components.mode, likely
 
-    def climb(
-        self, point: np.ndarray, fields: np.ndarray, counts: np.ndarray, flux: np.ndarray
-    ) -> RefinedPsfs:
-        """Move wavefronts (n, 8) to maxima of the posterior, and expand it there.
 
-        For the parameters see `begin` and its result.
-        """
-        psf, variance = np.empty((2, *counts.shape))
-        evidence, stars = np.empty(len(point)), np.arange(len(point))
-        for step in range(1, self.max_steps):
-            expansion = self.expand(point, counts[stars], flux[stars], fields[stars])
-            is_last = expansion.gain < self.min_gain
-            is_last |= step + 1 == self.max_steps
-            if is_last.any():
-                psf[stars[is_last]], variance[stars[is_last]] = expansion.moments(is_last)
-                evidence[stars[is_last]] = expansion.evidence[is_last]
-            point, stars = (point + expansion.components.mode)[~is_last], stars[~is_last]
-            if not stars.size:
-                break
-        return RefinedPsfs(psf, variance, evidence)
+def list_partners(group: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield for each member (n,) the numbers of all other members of its group, one after another.
+
+    Members of smaller groups are their own partners in the end.
+    """
+    order = np.argsort(group, kind="stable")
+    _, first, number, size = np.unique(
+        group[order], return_index=True, return_inverse=True, return_counts=True
+    )
+    first, size = first[number], size[number]
+    rank = np.arange(len(group)) - first
+    for step in range(1, size.max(initial=1)):
+        partner = np.empty(len(group), int)
+        partner[order] = order[first + (rank + np.where(step < size, step, 0)) % size]
+        yield partner
 
 
 @dataclass(frozen=True)

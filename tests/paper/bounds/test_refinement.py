@@ -21,6 +21,7 @@ from psfdae_paper.bounds.refinement import (
     SeidelPrior,
     invert,
 )
+from psfdae_paper.bounds.sampling import sample_posterior
 from psfdae_paper.bounds.stamp_model import StarPosteriors
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -147,6 +148,56 @@ def test_a_second_proposal_is_used_where_the_first_one_fails(model):
     assert errors[1] == pytest.approx(errors[2], rel=0.2)
 
 
+def test_the_same_wavefront_is_counted_once(model):
+    """A proposal close to another one adds nothing: neither to the mean nor to the evidence."""
+    stamps, *_, point = draw_stars(model, 10, 13)
+    rng, level = np.random.default_rng(14), np.full(10, 2e-3)
+    noisy = NOISE.draw(stamps, 2e-3, rng)
+    refiner, wrong = build_refiner(model), np.roll(point, 3, axis=0)
+    pair, three = np.stack([point, wrong], axis=1), np.stack([point, wrong, point + 1e-3], axis=1)
+    once, twice = (refiner.refine(noisy, level, propose(p, stamps)) for p in (pair, three))
+    distance = np.abs(twice.psf - once.psf) / np.sqrt(once.variance)
+    assert distance.max() < 0.05
+    assert twice.evidence == pytest.approx(once.evidence, abs=0.05)
+
+
+def test_wavefronts_of_similar_images_are_weighed_as_by_importance_samples(model):
+    """Two fields and several offsets explain a star: from one of them, all are found."""
+    count, level, rng = 6, 3e-3, np.random.default_rng(15)
+    two = replace(model, field=np.array([[0.6, 0.0], [0.6, 0.06]]))
+    star, middle, z = np.arange(count), np.zeros(2, int), rng.standard_normal((count, 5))
+    stamps = two.stamps(z, np.zeros(count, int), np.tile(middle, (count, 1))).astype(np.float64)
+    noisy = NOISE.draw(stamps, level, rng)
+    posteriors = StarPosteriors(noisy, Likelihood.from_noise(NOISE, level, stamps), two)
+    # Modes in both fields and at offsets of up to a pixel, and the exact posterior around them.
+    shifts = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+    blind = np.full(count, Knowledge.NONE)
+    starts = [
+        Modes.make_starts(star, np.full(count, field), np.tile(shift, (count, 1)), blind, z)
+        for field in range(2)
+        for shift in shifts
+    ]
+    modes = climb(Modes.join(starts), posteriors)
+    rngs = [np.random.default_rng([16, number]) for number in star]
+    sampled, _ = sample_posterior(modes, posteriors, np.full(count, -1), 500, rngs)
+    exact = sampled.with_truth
+    probability = exact.template_weight.sum(axis=2) / exact.weight_sum[:, None]
+    # Stars with enough samples, of which either field may be right.
+    is_tested = (exact.effective_size > 200) & (probability > 0.1).all(axis=1)
+    assert is_tested.sum() >= 3
+    refiner, means = build_refiner(two), []
+    for field in range(2):
+        points = two.coefficients(z, np.full(count, field))[:, None]
+        refined = refiner.refine(noisy, np.full(count, level), propose(points, stamps))
+        error = np.square(refined.psf - exact.mean_image).sum(axis=1) / exact.variance.sum(axis=1)
+        # The error is a small part of the posterior variance.
+        assert error[is_tested].max() < 0.15
+        means.append(refined.psf)
+    # Where the start is does not matter.
+    change = np.square(means[0] - means[1]).sum(axis=1) / exact.variance.sum(axis=1)
+    assert change[is_tested].max() < 0.05
+
+
 def test_a_star_with_a_companion_has_little_evidence(model):
     """Of a star alone, −2 ln of the evidence is near the number of pixels."""
     stamps, *_, point = draw_stars(model, 40, 11)
@@ -171,7 +222,8 @@ def test_refined_wavefront_is_the_maximum_of_the_posterior(model, monkeypatch):
     starts = Modes.make_starts(star, field, offset, np.full(12, Knowledge.FIELD), z)
     modes = select_best(climb(starts, StarPosteriors(noisy, likelihood, model)), field)
     expected = model.stamps(modes.z, modes.field, modes.offset).reshape(12, -1)
-    monkeypatch.setattr(Refiner, "min_gain", 1e-6)
+    # A new expansion at every step.
+    monkeypatch.setattr(Refiner, "linear_waves", 0.0)
     monkeypatch.setattr(Refiner, "max_steps", 10)
     monkeypatch.setattr(Refiner, "pupil_samples", (126, 158, 190, 222, 254))
     for number in star:
