@@ -502,19 +502,26 @@ class Refiner:
         distance : ndarray, shape (n, 4 f)
             Distance of the means from the own points, in waves.
         """
-        shift, log_mass = expansion.components.shift, expansion.components.log_mass.copy()
-        square, scaled = np.square(shift @ self.root).sum(axis=2), expansion.point @ self.root
+        components, half_deviance = expansion.components, 0.5 * expansion.deviance[:, None]
+        shift, scaled = components.shift, expansion.point @ self.root
+        distance, log_mass = np.linalg.norm(shift @ self.root, axis=2), components.log_mass.copy()
+        nearer = []
         for partner in list_partners(star):
-            # |δ + g|² of the gap g from the partner's point to the own one.
+            # |δ + g|² < |δ|² for the gap g from the partner's point to the own one.
             gap = scaled - scaled[partner]
             excess = 2.0 * (shift @ (gap @ self.root.T)[:, :, None])[:, :, 0]
-            excess += np.square(gap).sum(axis=1, keepdims=True)
-            # A component that two expansions leave to each other would be lost: a later one takes
-            # all that is nearer to it, an earlier one what is close to it.
-            is_earlier = (partner < np.arange(len(star)))[:, None]
-            is_close = square + excess < (0.5 * self.linear_waves) ** 2
-            log_mass[np.where(is_earlier, is_close, excess < 0.0)] = -np.inf
-        return replace(expansion.components, log_mass=log_mass), np.sqrt(square)
+            nearer.append((partner, excess < -np.square(gap).sum(axis=1, keepdims=True)))
+        # Later expansions take all components that are nearer to them.
+        for partner, is_nearer in nearer:
+            log_mass[is_nearer & (partner > np.arange(len(star)))[:, None]] = -np.inf
+        # Earlier ones do where they have mass close to their points: no component is lost.
+        close = np.where(distance < self.linear_waves, log_mass - half_deviance, -np.inf)
+        limit = close.max(axis=1) + self.max_gap
+        for partner, is_nearer in nearer:
+            is_given = log_mass - half_deviance < limit[partner, None]
+            is_given &= (partner < np.arange(len(star)))[:, None]
+            log_mass[is_nearer & is_given] = -np.inf
+        return replace(components, log_mass=log_mass), distance
 
     def begin(
         self, point: np.ndarray, damping: np.ndarray, counts: np.ndarray, flux: np.ndarray
