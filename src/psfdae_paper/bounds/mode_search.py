@@ -226,12 +226,22 @@ def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
 def add_elsewhere(places: Modes, starts: Modes) -> Modes:
     """Add to recentred places the starts in whose field and at whose offset their star has none.
 
-    At an offset that a place has, an unchanged start would lead to the same mode.
+    At an offset that a place has, an unchanged start would lead to the same mode. A place that
+    needs more knowledge of the star does not stand for a start that needs less.
     """
-    cells = [np.column_stack([modes.star, modes.field, modes.offset]) for modes in (places, starts)]
-    _, number = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
-    of_places, of_starts = np.split(number.ravel(), [places.star.size])
-    return Modes.join([places, starts.select(~np.isin(of_starts, of_places))])
+
+    def number_cells(knowledge: int) -> tuple[np.ndarray, np.ndarray]:
+        # Numbers of the cells (star, field, offset) of the starts, and of places up to a knowledge.
+        known = places.select(places.knowledge <= knowledge)
+        cells = [np.column_stack([m.star, m.field, m.offset]) for m in (starts, known)]
+        _, number = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
+        return number.ravel()[: starts.star.size], number.ravel()[starts.star.size :]
+
+    is_elsewhere = np.zeros(starts.star.size, bool)
+    for knowledge in np.unique(starts.knowledge):
+        is_new = ~np.isin(*number_cells(knowledge))
+        is_elsewhere |= is_new & (starts.knowledge == knowledge)
+    return Modes.join([places, starts.select(is_elsewhere)])
 
 
 def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.ndarray) -> Peaks:

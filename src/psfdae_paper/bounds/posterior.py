@@ -193,22 +193,21 @@ class Likelihood:
         """Split the log-likelihood of stamps p (K, P) into a product with residuals and a constant.
 
         Up to terms of the counts alone it is Σ n ℓ − F Σ p with ℓ = ln(1 + F p / B), which is
-        Σ (n − n̄)(ℓ − ℓ̄) + Σ n̄ ℓ − F Σ p.
+        Σ (n − n̄)(ℓ − ℓ̄) + Σ n̄ (ℓ − ℓ̄) − F Σ (p − p̄), with the mean image p̄ and its ℓ̄.
 
         Returns
         -------
         ratio : ndarray, shape (K, P), float64
             ℓ − ℓ̄, the factor of the residuals.
         offset : ndarray, shape (K,), float64
-            n̄·ℓ − F Σ p.
+            n̄·(ℓ − ℓ̄) − F Σ (p − p̄): small, too, so that single precision is enough for scores.
         """
         # ℓ̄ is ℓ of the mean image. Residuals and ℓ − ℓ̄ are small, and so is the error of their
         # product in single precision.
         scale = self.flux / self.background
-        ratio = np.log1p(scale * stamps)
-        offset = ratio @ self.predict_counts(self.mean_image) - self.flux * stamps.sum(axis=1)
-        ratio -= np.log1p(scale * self.mean_image)
-        return ratio, offset
+        ratio = np.log1p(scale * stamps) - np.log1p(scale * self.mean_image)
+        light = self.flux * (stamps.sum(axis=1) - self.mean_image.sum())
+        return ratio, ratio @ self.predict_counts(self.mean_image) - light
 
 
 @dataclass(frozen=True)
@@ -223,8 +222,8 @@ class ScoredStars:
         Numbers in `SYMMETRIES` and `list_jitters`.
     images : ndarray, shape (K, P), float32
         Noise-free images before `symmetry`.
-    scores : ndarray, shape (n, K), float64
-        Log-likelihood plus log-prior.
+    scores : ndarray, shape (n, K), float32
+        Log-likelihood plus log-prior, relative to the likelihood of the mean image.
     """
 
     star: np.ndarray
@@ -321,15 +320,16 @@ class PosteriorSums(Rows):
         log_scale = np.maximum(self.log_scale, part.scores.max(axis=1))
         # Images with a log-weight more than 30 below a star's best are left out: millions of them
         # together weigh less than 1e-6 of the best one.
-        columns = np.flatnonzero((part.scores > (log_scale - 30.0)[:, None]).any(axis=0))
+        lowest = (log_scale - 30.0).astype(np.float32)
+        columns = np.flatnonzero((part.scores > lowest[:, None]).any(axis=0))
         if not columns.size:
             return
         # The sums of stars with a new best image are rescaled to it.
         star_numbers = np.flatnonzero(log_scale != self.log_scale)
         self.put(star_numbers, self.select(star_numbers).rescale(log_scale[star_numbers]))
         # A star without any possible image so far keeps weights of zero.
-        log_weight = part.scores[:, columns] - np.maximum(log_scale, np.finfo(float).min)[:, None]
-        weight = np.exp(log_weight.astype(np.float32))
+        highest = np.maximum(log_scale, np.finfo(np.float32).min).astype(np.float32)
+        weight = np.exp(part.scores[:, columns] - highest[:, None])
         self.weight_sum += weight.sum(axis=1, dtype=np.float64)
         self.weight_square_sum += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
         # The symmetry moves the sum over images, instead of every image.
@@ -392,7 +392,8 @@ def score_bank(bank: Bank, noisy: np.ndarray, likelihood: Likelihood) -> Iterato
             images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
             for s, j in members:
                 # ln prior + Σ (n − n̄)(ℓ − ℓ̄) + offset
-                scores = mirrored_residuals[s] @ ratio_t + (offset + log_prior[:, s])
+                scores = mirrored_residuals[s] @ ratio_t
+                scores += (offset + log_prior[:, s]).astype(np.float32)
                 field = SYMMETRIES[s].field(part.field, bank.points)
                 yield ScoredStars(stars, field, s, j, images, scores)
 

@@ -232,6 +232,10 @@ def test_a_place_that_several_starts_reach_is_returned_once(stars, model, noise)
     far = replace(starts, offset=starts.offset + 5)
     assert add_elsewhere(places, starts).star.size == 4
     assert add_elsewhere(places, far).star.size == 4 + number.size
+    # Places that were reached with the field known do not stand for a search without it.
+    blind = replace(starts, knowledge=np.full(number.size, Knowledge.NONE))
+    assert add_elsewhere(places, blind).star.size == 4 + number.size
+    assert add_elsewhere(recentre(blind, posteriors), starts).star.size == 4
 
 
 def test_a_mode_found_without_the_field_explains_the_star_in_its_field(modes, stars, model, noise):
