@@ -398,7 +398,9 @@ def test_derivatives_of_a_grid_are_those_of_its_light(sky):
     slopes = grid.slopes(place, corner, 9)[0]
     for slope, move in zip(slopes, step * np.eye(2), strict=True):
         low, high = (grid.stamps(place + s * move, corner, 9)[0] for s in (-1, 1))
-        assert slope == pytest.approx((high - low) / (2 * step), abs=2e-3 * float(np.abs(slope).max()))
+        assert slope == pytest.approx(
+            (high - low) / (2 * step), abs=2e-3 * float(np.abs(slope).max())
+        )
 
 
 def test_the_command_and_its_table(sky, tmp_path):
