@@ -285,7 +285,7 @@ def sample_stars(
     model = build_stamp_model(config).coarsen(likelihood)
     posteriors = StarPosteriors(stars.noisy[level], likelihood, model)
     # Bounds need every mode: more starts than in a method, and more for doubtful stars.
-    modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=2.0)
+    modes, _ = search(bank, posteriors, stars.field, fields=16, offsets=16, misfit_sigma=1.0)
     true_modes = climb(get_true_modes(posteriors.model, product, stars), posteriors)
     modes = separate(Modes.join([modes, true_modes]))
     # A star's draws do not depend on the other stars: each has a stream by its number.

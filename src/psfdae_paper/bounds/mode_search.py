@@ -66,7 +66,7 @@ def search(
         Number of offsets with the best matches in the star's own field, if it is known.
     misfit_sigma : float
         More modes are searched if χ² of a star's best mode exceeds its expectation by this many
-        standard deviations. By chance this happens for a few stars in 1000; with 2, for 1 in 40.
+        standard deviations. By chance this happens for a few stars in 1000; with 1, for 1 in 6.
 
     Returns
     -------
@@ -91,8 +91,7 @@ def search(
     # First from a few matches of every star, unchanged and recentred.
     few = np.where(starts.knowledge == Knowledge.NONE, fields, offsets)
     is_first = rank_in_group(starts.group, np.arange(starts.star.size)) < few
-    first = starts.select(is_first)
-    modes = climb(add_elsewhere(recentre(first, posteriors), first), posteriors)
+    modes = climb(with_recentred(starts.select(is_first), posteriors), posteriors)
     # Then from the other matches of stars that the modes do not explain, and twice from all around
     # the best modes of stars that are still not explained.
     for attempt in range(3):
@@ -103,9 +102,9 @@ def search(
             further = starts.select(~is_first & np.isin(starts.star, misfits.star))
             if not further.star.size:
                 continue
-            trials = add_elsewhere(recentre(further, posteriors), further)
+            trials = with_recentred(further, posteriors)
         else:
-            trials = recentre(place_corners(misfits), posteriors)
+            trials = recentre(place_corners(misfits), posteriors)[0]
         # Their modes climb along, so that climbs far below these are abandoned.
         is_misfit = np.isin(modes.star, misfits.star)
         trials = climb(Modes.join([modes.select(is_misfit), trials]), posteriors)
@@ -201,11 +200,25 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
     return separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
 
 
-def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
+def with_recentred(starts: Modes, posteriors: StarPosteriors) -> Modes:
+    """Return recentred starts, and unchanged ones whose stamps are moved by recentring."""
+    # A climb at the offset of the start leads to the mode that it has reached with a free offset.
+    places, is_moved = recentre(starts, posteriors)
+    return Modes.join([places, starts.select(is_moved)])
+
+
+def recentre(modes: Modes, posteriors: StarPosteriors) -> tuple[Modes, np.ndarray]:
     """Refine starts with a free stamp offset, rounded to whole pixels.
 
     A stamp that is off by a pixel leads to another mode, mostly a wrong one, from which steps of
-    whole pixels do not lead back. A place that several starts reach is returned once.
+    whole pixels do not lead back.
+
+    Returns
+    -------
+    places : Modes
+        Refined starts; a place that several starts reach is returned once.
+    is_moved : ndarray of bool, shape (M,)
+        True for starts whose offset has changed.
     """
     # Prior of the shift along rows and columns: normal, with this standard deviation.
     shift_sd_px = 1.5
@@ -214,34 +227,14 @@ def recentre(modes: Modes, posteriors: StarPosteriors) -> Modes:
     # Unknowns are z, then the shift in units of its standard deviation.
     peaks, terms = _climb_along(modes, posteriors, tilts), modes.z.shape[1]
     z, shifts = np.split(peaks.parameters, [terms], axis=1)
-    offset = modes.offset - np.rint(shift_sd_px * shifts).astype(int)
+    shift_px = np.rint(shift_sd_px * shifts).astype(int)
     # Many climbs end at the same maximum, and offsets are whole pixels: the best free maxima are
     # the best places to start from, each once.
     covariance, evidence = peaks.laplace()
-    factor = np.linalg.cholesky(covariance[:, :terms, :terms])
+    factor, offset = np.linalg.cholesky(covariance[:, :terms, :terms]), modes.offset - shift_px
     places = separate(replace(modes, offset=offset, z=z, factor=factor, evidence=evidence))
-    return Modes.make_starts(places.star, places.field, places.offset, places.knowledge, places.z)
-
-
-def add_elsewhere(places: Modes, starts: Modes) -> Modes:
-    """Add to recentred places the starts in whose field and at whose offset their star has none.
-
-    At an offset that a place has, an unchanged start would lead to the same mode. A place that
-    needs more knowledge of the star does not stand for a start that needs less.
-    """
-
-    def number_cells(knowledge: int) -> tuple[np.ndarray, np.ndarray]:
-        # Numbers of the cells (star, field, offset) of the starts, and of places up to a knowledge.
-        known = places.select(places.knowledge <= knowledge)
-        cells = [np.column_stack([m.star, m.field, m.offset]) for m in (starts, known)]
-        _, number = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
-        return number.ravel()[: starts.star.size], number.ravel()[starts.star.size :]
-
-    is_elsewhere = np.zeros(starts.star.size, bool)
-    for knowledge in np.unique(starts.knowledge):
-        is_new = ~np.isin(*number_cells(knowledge))
-        is_elsewhere |= is_new & (starts.knowledge == knowledge)
-    return Modes.join([places, starts.select(is_elsewhere)])
+    columns = places.star, places.field, places.offset, places.knowledge, places.z
+    return Modes.make_starts(*columns), (shift_px != 0).any(axis=1)
 
 
 def _climb_along(modes: Modes, posteriors: StarPosteriors, added_directions: np.ndarray) -> Peaks:

@@ -12,12 +12,12 @@ from psfdae.base.rng import stream
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.mode_search import (
-    add_elsewhere,
     climb,
     find_twins,
     find_unexplained,
     recentre,
     select_best,
+    with_recentred,
 )
 from psfdae_paper.bounds.modes import Knowledge, Modes
 from psfdae_paper.bounds.posterior import Likelihood, list_jitters, merge
@@ -213,7 +213,8 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
         start = Modes.make_starts(
             number, 0 * number, offset + shift, np.full(len(z), Knowledge.FIELD), z
         )
-        modes = recentre(start, posteriors)
+        modes, is_moved = recentre(start, posteriors)
+        assert (is_moved == (modes.offset != start.offset).any(axis=1)).all()
         back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
@@ -226,16 +227,15 @@ def test_a_place_that_several_starts_reach_is_returned_once(stars, model, noise)
     knowledge = np.full(number.size, Knowledge.FIELD)
     beside = z[number] + np.outer(np.tile(np.linspace(-0.2, 0.2, 5), len(z)), np.ones(5))
     starts = Modes.make_starts(number, 0 * number, offset[number], knowledge, beside)
-    places = recentre(starts, posteriors)
-    assert np.bincount(places.star).tolist() == [1, 1, 1, 1]
-    # A start elsewhere is added unchanged, starts at the places are not.
-    far = replace(starts, offset=starts.offset + 5)
-    assert add_elsewhere(places, starts).star.size == 4
-    assert add_elsewhere(places, far).star.size == 4 + number.size
-    # Places that were reached with the field known do not stand for a search without it.
-    blind = replace(starts, knowledge=np.full(number.size, Knowledge.NONE))
-    assert add_elsewhere(places, blind).star.size == 4 + number.size
-    assert add_elsewhere(recentre(blind, posteriors), starts).star.size == 4
+    places, is_moved = recentre(starts, posteriors)
+    assert np.bincount(places.star).tolist() == [1, 1, 1, 1] and not is_moved.any()
+    # Starts are added unchanged where their own offset has changed.
+    assert with_recentred(starts, posteriors).star.size == 4
+    aside = replace(starts, offset=starts.offset + 1)
+    moved = int(recentre(aside, posteriors)[1].sum())
+    both = with_recentred(aside, posteriors)
+    assert moved > 10 and both.star.size == len(recentre(aside, posteriors)[0].star) + moved
+    assert (both.z[-moved:, None] == aside.z).all(axis=2).any(axis=1).all()
 
 
 def test_a_mode_found_without_the_field_explains_the_star_in_its_field(modes, stars, model, noise):
