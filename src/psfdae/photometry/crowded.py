@@ -161,7 +161,8 @@ def photometry(
     wings, wing_light = model.wings, np.zeros_like(image)
     # The first errors are from the pixels themselves, light of neighbours included.
     error = pixel_error(sky.noise, sky.signal, gain)
-    # Positions of all stars that were found in residuals, each is tried once, and of the last ones.
+    # Positions of all stars that were found in residuals, each of which is tried once, and of the
+    # stars that the last search has found.
     peaks, new = np.empty((0, 2)), np.empty((0, 2))
     # Positions by the list, and their error, as soon as its bright stars have shown it.
     is_listed, position_prior = observation.detections is None, None
@@ -206,10 +207,8 @@ def photometry(
         # Stars that were found in residuals are dropped if they are none.
         doubt = _psf_doubt(position, flux, side, area_px)
         is_real = find_real(position, fit, doubt, observation.count, threshold, 0.5 * fwhm)
-        changed, position, flux, origin = (
-            np.concatenate([new, position[~is_real]]),
-            *(values[is_real] for values in (position, flux, origin)),
-        )
+        changed_positions = np.concatenate([new, position[~is_real]])
+        position, flux, origin = position[is_real], flux[is_real], origin[is_real]
         # More stars in the residuals, whose σ has the errors of the models. The last two fits drop
         # stars and find none; of two fits, none drops any. From the third search on, sky and errors
         # stay as they are if few stars change: only these can show others.
@@ -222,7 +221,9 @@ def photometry(
                 np.concatenate([position, peaks]),
                 threshold,
                 fwhm,
-                changed if turn > 1 and len(changed) < 0.05 * len(position) else None,
+                changed_positions
+                if turn > 1 and len(changed_positions) < 0.05 * len(position)
+                else None,
             )
             position, origin, peaks = (np.concatenate([p, new]) for p in (position, origin, peaks))
             flux = np.append(flux, new_flux)
@@ -238,11 +239,10 @@ def photometry(
     stars["flags"] |= star_flags(stars, bad & ~is_saturated, is_saturated, box_px, fwhm)
     # Fluxes of all stars are wrong if the PSF does not fit, also of those too faint to show it.
     chi2_ratio = flag_misfit(fit, stars["flags"], area_px * model.residual_variance(box_px))
-    light = fit.light + wing_light
     # In the unit of the image.
-    return CrowdedPhotometry(model, stars, sky.signal, light, wings_used, wings, chi2_ratio).times(
-        1.0 / unit
-    )
+    return CrowdedPhotometry(
+        model, stars, sky.signal, fit.light + wing_light, wings_used, wings, chi2_ratio
+    ).times(1.0 / unit)
 
 
 def locate_listed_stars(

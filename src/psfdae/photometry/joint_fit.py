@@ -250,9 +250,9 @@ class _Fit:
             self._light[part] = self.psfs.stamps(*stamps, splines=splines)
             # The box stays where it is while the stamp moves with its star: its light is drawn by
             # itself, with its derivatives.
-            box = position, box_corner, self.box_px, None, splines
-            self._derivatives[part, 0] = self.psfs.stamps(*box)
-            self._derivatives[part, 1:] = self.psfs.slopes(*box)
+            box = position, box_corner, self.box_px
+            self._derivatives[part, 0] = self.psfs.stamps(*box, splines=splines)
+            self._derivatives[part, 1:] = self.psfs.slopes(*box, splines=splines)
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""

@@ -594,8 +594,8 @@ class Rings(NamedTuple):
         log_r, end = np.log(np.maximum(radius, 1.0)), self.log_radius[-1]
         scaled_level = self.level * np.exp(3.0 * self.log_radius)
         light = np.interp(log_r, self.log_radius, scaled_level)
-        beyond = self.slope * np.maximum(log_r - end, 0.0)
-        light *= np.exp(beyond - 3.0 * np.minimum(log_r, end))
+        outer_exponent = self.slope * np.maximum(log_r - end, 0.0)
+        light *= np.exp(outer_exponent - 3.0 * np.minimum(log_r, end))
         light[radius >= 256.0] = 0.0
         return np.asarray(light)
 

@@ -167,19 +167,19 @@ class PsfGrid:
         centre: np.ndarray,
         corner: np.ndarray,
         side_px: int,
-        flux: np.ndarray | None = None,
         splines: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the derivatives of the light of `stamps` by x and y of the star, per pixel.
 
-        Parameters are as in `stamps`; the change of the PSF over the field is left out.
+        Parameters are as in `stamps`; PSFs are as at the middle magnitude unless splines are given.
+        The change of the PSF over the field is left out.
 
         Returns
         -------
         ndarray, shape (n, 2, side_px, side_px), float32
             0 beyond the edge of the PSF.
         """
-        stars = centre, corner, side_px, flux, splines
+        stars = centre, corner, side_px, None, splines
         # A star that moves by a pixel moves by −o knots under its pixels.
         return -self.oversampling * self._sum_splines(*stars, with_slopes=True)
 

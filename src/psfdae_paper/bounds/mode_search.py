@@ -89,9 +89,9 @@ def search(
         matches.append(replace(in_group, star=stars[in_group.star]))
     starts = Modes.join(matches)
     # First from a few matches of every star, unchanged and recentred.
-    few = np.where(starts.knowledge == Knowledge.NONE, fields, offsets)
-    is_first = rank_in_group(starts.group, np.arange(starts.star.size)) < few
-    modes = climb(with_recentred(starts.select(is_first), posteriors), posteriors)
+    first_count = np.where(starts.knowledge == Knowledge.NONE, fields, offsets)
+    is_first = rank_in_group(starts.group, np.arange(starts.star.size)) < first_count
+    modes = climb(propose_starts(starts.select(is_first), posteriors), posteriors)
     # Then from the other matches of stars that the modes do not explain, and twice from all around
     # the best modes of stars that are still not explained.
     for attempt in range(3):
@@ -99,10 +99,10 @@ def search(
         if not misfits.star.size:
             break
         if attempt == 0:
-            further = starts.select(~is_first & np.isin(starts.star, misfits.star))
-            if not further.star.size:
+            other_starts = starts.select(~is_first & np.isin(starts.star, misfits.star))
+            if not other_starts.star.size:
                 continue
-            trials = with_recentred(further, posteriors)
+            trials = propose_starts(other_starts, posteriors)
         else:
             trials = recentre(place_corners(misfits), posteriors)[0]
         # Their modes climb along, so that climbs far below these are abandoned.
@@ -113,8 +113,8 @@ def search(
     if in_all_fields:
         modes = climb(Modes.join([modes, find_twins(modes, posteriors)]), posteriors)
     # χ² four standard deviations above its mean: no mode explains the star.
-    best = select_best(modes, star_field)
-    return modes, np.unique(find_unexplained(best, posteriors, 4.0).star)
+    misfits = find_unexplained(select_best(modes, star_field), posteriors, 4.0)
+    return modes, np.unique(misfits.star)
 
 
 def find_best_matches(
@@ -200,9 +200,9 @@ def climb(modes: Modes, posteriors: StarPosteriors) -> Modes:
     return separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
 
 
-def with_recentred(starts: Modes, posteriors: StarPosteriors) -> Modes:
-    """Return recentred starts, and unchanged ones whose stamps are moved by recentring."""
-    # A climb at the offset of the start leads to the mode that it has reached with a free offset.
+def propose_starts(starts: Modes, posteriors: StarPosteriors) -> Modes:
+    """Return recentred starts, and also the original ones where recentring moves the stamp."""
+    # Where it does not, a climb from the original start would lead to the same mode.
     places, is_moved = recentre(starts, posteriors)
     return Modes.join([places, starts.select(is_moved)])
 
@@ -282,18 +282,18 @@ def select_best(modes: Modes, star_field: np.ndarray | None) -> Modes:
     Returns
     -------
     Modes
-        At most two for every star. A mode that is the best in the star's field only has the
+        At most two for every star. A mode that is the best of its field, but not of all, has the
         knowledge `Knowledge.FIELD`.
     """
 
-    def best_of(numbers: np.ndarray) -> np.ndarray:
+    def find_best(numbers: np.ndarray) -> np.ndarray:
         return np.asarray(numbers[select_largest(modes.star[numbers], modes.evidence[numbers], 1)])
 
-    blind = best_of(np.flatnonzero(modes.knowledge == Knowledge.NONE))
+    blind = find_best(np.flatnonzero(modes.knowledge == Knowledge.NONE))
     if star_field is None:
         return modes.select(blind)
     # The best mode in the field may have been found without knowledge of it.
-    in_field = best_of(np.flatnonzero(modes.field == star_field[modes.star]))
+    in_field = find_best(np.flatnonzero(modes.field == star_field[modes.star]))
     in_field_only = modes.select(np.setdiff1d(in_field, blind))
     knowledge = np.full(in_field_only.star.size, Knowledge.FIELD)
     return Modes.join([modes.select(blind), replace(in_field_only, knowledge=knowledge)])
@@ -302,8 +302,8 @@ def select_best(modes: Modes, star_field: np.ndarray | None) -> Modes:
 def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: float) -> Modes:
     """Select the modes that do not explain the image of their star.
 
-    They do not if χ² = Σ (n − μ)²/μ is more than `misfit_sigma` standard deviations above its mean
-    for the right mode (`compute_deviance_limit`).
+    A mode does not if χ² = Σ (n − μ)²/μ is more than `misfit_sigma` standard deviations above its
+    mean for the right mode (`compute_deviance_limit`).
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def find_unexplained(modes: Modes, posteriors: StarPosteriors, misfit_sigma: flo
 
 
 def place_corners(modes: Modes) -> Modes:
-    """Place starts all around modes.
+    """Place starts on all sides of modes.
 
     They are for stars whose climbs have ended in local maxima: a climb that starts next to such a
     maximum mostly ends elsewhere. Starts are the 2⁵ corners of a cube around the mode, 0.5 away

@@ -432,10 +432,10 @@ class Refiner:
         return np.asarray(np.linalg.cholesky((light * deviation) @ deviation.T))
 
     def find_distinct(self, star: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Return False for wavefronts (n, 8) that an earlier one of the same star is near, (n,)."""
-        scaled, is_distinct = point @ self.root, np.ones(len(star), bool)
+        """Return False for wavefronts (n, 8) near an earlier one of the same star, shape (n,)."""
+        coordinates, is_distinct = point @ self.root, np.ones(len(star), bool)
         for partner in list_partners(star):
-            distance = np.linalg.norm(scaled[partner] - scaled, axis=1)
+            distance = np.linalg.norm(coordinates[partner] - coordinates, axis=1)
             is_distinct &= (partner >= np.arange(len(star))) | (distance > self.linear_waves)
         return is_distinct
 
@@ -468,17 +468,17 @@ class Refiner:
         stars, every_field = star, likely_fields
         expansion = self.expand(point, counts[star], flux[star], likely_fields)
         for _ in range(2, self.max_steps):
-            owned, distance = self.assign(stars, expansion)
+            components, distance = self.assign(stars, expansion)
             # Mass of the components that are far from all expansion points.
-            log_mass = owned.log_mass - 0.5 * expansion.deviance[:, None]
+            log_mass = components.log_mass - 0.5 * expansion.deviance[:, None]
             far_log_mass = np.where(distance > self.linear_waves, log_mass, -np.inf)
-            total, far = np.full((2, len(counts)), -np.inf)
-            np.logaddexp.at(total, stars, np.logaddexp.reduce(log_mass, axis=1))
-            np.logaddexp.at(far, stars, np.logaddexp.reduce(far_log_mass, axis=1))
+            log_total, log_far_total = np.full((2, len(counts)), -np.inf)
+            np.logaddexp.at(log_total, stars, np.logaddexp.reduce(log_mass, axis=1))
+            np.logaddexp.at(log_far_total, stars, np.logaddexp.reduce(far_log_mass, axis=1))
             # The next point of a star is the largest of them.
             largest = far_log_mass.max(axis=1)
             is_next = (largest == group_maximum(largest, stars)) & (largest > -np.inf)
-            is_next &= far[stars] > total[stars] + np.log(self.min_far_mass)
+            is_next &= log_far_total[stars] > log_total[stars] + np.log(self.min_far_mass)
             if not is_next.any():
                 break
             star, likely_fields = stars[is_next], every_field[is_next]
@@ -487,37 +487,37 @@ class Refiner:
             new = self.expand(point, counts[star], flux[star], likely_fields)
             stars, expansion = np.concatenate([stars, star]), Expansion.join([expansion, new])
             every_field = np.concatenate([every_field, likely_fields])
-        owned, _ = self.assign(stars, expansion)
+        components, _ = self.assign(stars, expansion)
         # Other points may have all components of an expansion.
-        has_mass = np.isfinite(owned.log_mass).any(axis=1)
-        return stars[has_mass], replace(expansion, components=owned).select(has_mass)
+        has_mass = np.isfinite(components.log_mass).any(axis=1)
+        return stars[has_mass], replace(expansion, components=components).select(has_mass)
 
     def assign(self, star: np.ndarray, expansion: Expansion) -> tuple[Components, np.ndarray]:
         """Give every component to an expansion whose point is near its mean, and to no other.
 
         Returns
         -------
-        owned : Components
-            Components, of mass 0 where they belong to another expansion.
+        components : Components
+            Components of each expansion, of mass 0 where they belong to another one.
         distance : ndarray, shape (n, 4 f)
             Distance of the means from the own points, in waves.
         """
         components, half_deviance = expansion.components, 0.5 * expansion.deviance[:, None]
-        shift, scaled = components.shift, expansion.point @ self.root
+        shift, coordinates = components.shift, expansion.point @ self.root
         distance, log_mass = np.linalg.norm(shift @ self.root, axis=2), components.log_mass.copy()
-        nearer = []
+        comparisons = []
         for partner in list_partners(star):
             # |δ + g|² < |δ|² for the gap g from the partner's point to the own one.
-            gap = scaled - scaled[partner]
+            gap = coordinates - coordinates[partner]
             excess = 2.0 * (shift @ (gap @ self.root.T)[:, :, None])[:, :, 0]
-            nearer.append((partner, excess < -np.square(gap).sum(axis=1, keepdims=True)))
+            comparisons.append((partner, excess < -np.square(gap).sum(axis=1, keepdims=True)))
         # Later expansions take all components that are nearer to them.
-        for partner, is_nearer in nearer:
+        for partner, is_nearer in comparisons:
             log_mass[is_nearer & (partner > np.arange(len(star)))[:, None]] = -np.inf
         # Earlier ones do where they have mass close to their points: no component is lost.
         close = np.where(distance < self.linear_waves, log_mass - half_deviance, -np.inf)
         limit = close.max(axis=1) + self.max_gap
-        for partner, is_nearer in nearer:
+        for partner, is_nearer in comparisons:
             is_given = log_mass - half_deviance < limit[partner, None]
             is_given &= (partner < np.arange(len(star)))[:, None]
             log_mass[is_nearer & is_given] = -np.inf
@@ -560,7 +560,7 @@ class Refiner:
 def list_partners(group: np.ndarray) -> Iterator[np.ndarray]:
     """Yield for each member (n,) the numbers of all other members of its group, one after another.
 
-    Members of smaller groups are their own partners in the end.
+    A member of a smaller group is its own partner as soon as there are no others left.
     """
     order = np.argsort(group, kind="stable")
     _, first, number, size = np.unique(

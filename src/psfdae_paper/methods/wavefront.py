@@ -224,8 +224,7 @@ class Wavefront(PhotonMethod):
             # A random stream for each star: its result does not depend on the others.
             names = (self.data.seed, self.name, f"{level:.6g}")
             rngs = [stream(*names, int(star)) for star in block]
-            model = self.model.coarsen(likelihood)
-            posteriors = StarPosteriors(noisy[block], likelihood, model)
+            posteriors = StarPosteriors(noisy[block], likelihood, self.model.coarsen(likelihood))
             no_field = np.full(len(block), -1)
             samples, _ = sample_posterior(modes, posteriors, no_field, self.draws_per_star, rngs)
             sums.put(block, samples.with_truth)

@@ -15,9 +15,9 @@ from psfdae_paper.bounds.mode_search import (
     climb,
     find_twins,
     find_unexplained,
+    propose_starts,
     recentre,
     select_best,
-    with_recentred,
 )
 from psfdae_paper.bounds.modes import Knowledge, Modes
 from psfdae_paper.bounds.posterior import Likelihood, list_jitters, merge
@@ -230,10 +230,10 @@ def test_a_place_that_several_starts_reach_is_returned_once(stars, model, noise)
     places, is_moved = recentre(starts, posteriors)
     assert np.bincount(places.star).tolist() == [1, 1, 1, 1] and not is_moved.any()
     # Starts are added unchanged where their own offset has changed.
-    assert with_recentred(starts, posteriors).star.size == 4
+    assert propose_starts(starts, posteriors).star.size == 4
     aside = replace(starts, offset=starts.offset + 1)
     moved = int(recentre(aside, posteriors)[1].sum())
-    both = with_recentred(aside, posteriors)
+    both = propose_starts(aside, posteriors)
     assert moved > 10 and both.star.size == len(recentre(aside, posteriors)[0].star) + moved
     assert (both.z[-moved:, None] == aside.z).all(axis=2).any(axis=1).all()
 

@@ -103,9 +103,10 @@ def test_bounds_of_scene_1(scene_1):
     rows = table.set_index(["reference", "method", "noise_level"])
     cells = rows.value
     for level in LEVELS:
-        # The floor is an expected error; errors of a few stars scatter about theirs.
-        highest = rows.ci_high["realisation", "bayes", level]
-        assert cells["realisation", "floor", level] < highest
+        # Both are expected errors, without the scatter of a few stars; the floor, a linear
+        # approximation, may be undercut by 15 %.
+        variance = rows.variance["realisation", "bayes", level]
+        assert cells["realisation", "floor", level] < 1.15 * variance
         noisy = (4.98 * level) ** 2
         assert cells["realisation", "bayes", level] < noisy
     # Where the bank is dense enough, to be told the field helps.
