@@ -181,3 +181,21 @@ def test_sizes_that_are_none_are_refused(text):
     run = CliRunner().invoke(image_costs.compare_tools, options)
     assert run.exit_code == 2
     assert "expected words SIDE:STARS" in run.output
+
+
+def test_levels_of_the_costs_are_those_with_a_tight_mean_without_the_position():
+    keys = {"dataset": "d", "reference": "realisation", "metric": "mse", "missing": 0}
+    rows = [
+        {**keys, "method": method, "noise_level": level, "value": value, "tight": tight}
+        for method, level, value, tight in [
+            ("bayes", 0.1, 1.0, "yes"),
+            ("bayes", 0.2, 2.0, "no"),
+            ("bayes_position", 0.1, 0.5, "no"),
+            ("bayes_position", 0.2, 0.7, "yes"),
+        ]
+    ]
+    assert costs.least_errors(pd.DataFrame(rows), "d", False) == ({0.1: 1.0}, True)
+    assert costs.least_errors(pd.DataFrame(rows), "d", True) == ({0.1: 0.5}, False)
+    # Without a tight mean all levels are taken.
+    none = pd.DataFrame(rows).assign(tight="no")
+    assert costs.least_errors(none, "d", False) == ({0.1: 1.0, 0.2: 2.0}, False)

@@ -84,24 +84,28 @@ def cost(
 ) -> None:
     """Time METHOD on one thread: its fit, and the stars whose least possible error is known."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    bound = least_errors(read_table(bounds), dataset, method_class(name).needs.position)
+    knows_position = method_class(name).needs.position
+    bound, is_tight = least_errors(read_table(bounds), dataset, knows_position)
     row = isolated(1, time_method, name, config.model_dump(), stars, bound)
-    write(out, [{"dataset": dataset, "method": name, "point": point, **row}])
+    key = {"dataset": dataset, "method": name, "point": point}
+    write(out, [{**key, **row, "tight": "yes" if is_tight else "no"}])
 
 
 def least_errors(bounds, dataset, knows_position):
-    """Return the least possible error (posterior mean, realisation) by noise level λ.
+    """Return the least possible error by noise level λ, and whether it is known at all levels.
 
-    Levels are those at which the bounds with and without the position in the field are tight for
-    all stars; all levels if there is none.
+    It is the error of the posterior mean against the realisation, with or without the position in
+    the field. Levels are those at which the one without is tight for all stars, so that all methods
+    have the same levels; all levels if there is none. The one with the position may not be tight
+    there, so that the minimum error may be lower.
     """
     rows = bounds.query("dataset == @dataset and reference == 'realisation' and metric == 'mse'")
     columns = ["value", "tight", "missing"]
     table = rows.pivot(index="noise_level", columns="method", values=columns)
-    means = ["bayes", "bayes_position"]
-    tight = table.tight[means].eq("yes") & table.missing[means].eq(0)
-    levels = table.index[tight.all(axis=1)] if tight.all(axis=1).any() else table.index
-    return table.value[means[knows_position]][levels].astype(float).to_dict()
+    is_tight = table.tight.eq("yes") & table.missing.eq(0)
+    levels = table.index[is_tight.bayes] if is_tight.bayes.any() else table.index
+    mean = "bayes_position" if knows_position else "bayes"
+    return table.value[mean][levels].astype(float).to_dict(), bool(is_tight[mean][levels].all())
 
 
 def time_method(name, tree, stars, bound):

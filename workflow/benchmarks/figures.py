@@ -150,7 +150,7 @@ def costs(table):
             axes.set(**LOGS)
             axes.grid(True, which="both")
             axes.margins(0.08)
-        # The least possible error is known well enough at some noise levels only.
+        # The least possible error without the field is known well enough at some noise levels only.
         first = measured.iloc[0]
         levels = str(first["noise_levels"]).replace(" ", ", ")
         row[0].set_title(f"{dataset}: {first['stars']} stars, λ = {levels}", loc="left", fontsize=9)
@@ -162,6 +162,9 @@ def costs(table):
     handles += [entry(label, **{**style, "ms": 9}) for label, style in MARKS.values()]
     handles.append(entry("Pareto front", color="0.6", lw=3.0))
     handles.append(entry("least possible error", color="black", lw=1.0))
+    if "no" in {*table["tight"]}:
+        open_marker = {"color": "black", "mfc": "white", "marker": "o", "ls": "", "ms": 8}
+        handles.append(entry("over an upper limit of it", **open_marker))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     figure.suptitle("Error against time: fit (left) and inference (right)")
     return figure
@@ -170,6 +173,9 @@ def costs(table):
 def draw_method(fit_axes, star_axes, points, look):
     """Draw a method's settings against the time of the fit, and that in use against a star's."""
     style = {"color": look.color, "marker": look.marker, "ms": 6, "lw": 1.2, "capsize": 2}
+    # Open markers: the minimum error may be lower than the bound.
+    if (points["tight"] == "no").any():
+        style["mfc"] = "white"
     lengths = points[points["point"] != "paper"]
     for axes, rows, time in (
         (fit_axes, lengths, "fit_cpu_s"),

@@ -121,10 +121,18 @@ def test_memory_is_not_extrapolated(record_table):
 
 
 def test_costs_say_on_which_noise_levels_they_rest(record_table):
-    # Tables of earlier versions have no standard errors.
-    earlier = record_table("benchmark_costs").drop(columns="over_least_stderr", errors="ignore")
-    for table in (earlier, earlier.assign(over_least_stderr=0.1)):
-        titles = [axes.get_title(loc="left") for axes in apply_style(figures.costs)(table).axes]
-        for dataset, rows in table.groupby("dataset"):
-            levels = str(rows.noise_levels.iloc[0]).replace(" ", ", ")
-            assert f"{dataset}: {rows.stars.iloc[0]} stars, λ = {levels}" in titles
+    table = record_table("benchmark_costs").assign(tight="yes", over_least_stderr=0.1)
+    axes = apply_style(figures.costs)(table).axes
+    titles = [each.get_title(loc="left") for each in axes]
+    for dataset, rows in table.groupby("dataset"):
+        levels = str(rows.noise_levels.iloc[0]).replace(" ", ", ")
+        assert f"{dataset}: {rows.stars.iloc[0]} stars, λ = {levels}" in titles
+
+
+@pytest.mark.parametrize(("tight", "expected"), [("yes", 0), ("no", 1)])
+def test_methods_whose_bound_is_not_tight_have_open_markers(record_table, tight, expected):
+    table = record_table("benchmark_costs").assign(tight="yes", over_least_stderr=0.1)
+    table.loc[table.method == "gmm_position", "tight"] = tight
+    figure = apply_style(figures.costs)(table)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels.count("over an upper limit of it") == expected
