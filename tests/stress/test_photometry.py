@@ -1,11 +1,10 @@
 """Fluxes, and stars that are not as they should be."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from psfdae.denoise.flux_model import FluxModel, robust_flux
+from psfdae.denoise.stamp_arrays import make_stamps
 from psfdae.image.sky import border_median
 from psfdae.image.stamps import StarFlag
 
@@ -94,11 +93,12 @@ def test_hot_pixels(bench, record):
 
 def measured(bench, images):
     """Photometry of stamps of which nothing is known, as `predict` does it."""
-    bad = ~np.isfinite(images)
-    stamps, nan = np.where(bad, 0.0, images), np.full(len(images), np.nan)
-    known = SimpleNamespace(flux=nan, background=nan, noise=nan)
+    numbers = dict.fromkeys(("flux", "background", "noise", "gain"))
+    masks = dict.fromkeys(("bad", "saturated"))
+    stars, _ = make_stamps(images, images.shape[-1], "stress", numbers, masks, None, None)
+    sky = border_median(stars.data, stars.bad)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return bench.photometer.measure(stamps, bad, border_median(stamps, bad), known)
+        return bench.photometer.measure(stars.data, stars.bad, sky, stars)
 
 
 def bright_stars(bench, count):
