@@ -34,7 +34,7 @@ rule dataset_bounds:
     threads: lambda w: load_dataset_config(RUN, w.dataset).bounds.threads
     resources:
         mem_mb=1500,
-        runtime=20,
+        runtime=90,
     params:
         config=lambda w: settings(RUN, "bounds", f"dataset={w.dataset}"),
         source=hash_code("bounds"),
@@ -61,7 +61,7 @@ rule dataset_optics:
         f"{RESULTS}/benchmarks_on_request/bounds/optics-{{dataset}}.tsv"
     resources:
         mem_mb=1500,
-        runtime=30,
+        runtime=90,
     params:
         config=lambda w: settings(RUN, "optics", f"dataset={w.dataset}"),
         source=hash_code("optics"),
