@@ -350,11 +350,14 @@ def fit_case_scales(model: StarModel, stars: HeldOutStars, seed: int) -> ErrorMo
     nodes, count = errors.noise, len(Estimated)
     # A method that measures stars needs no factor of their fluxes: for their pixels, which are
     # many, a sixth of the images is enough in each case. Its errors are the same if noise is known.
-    step, noise_cases = (6, (True,)) if model.method.knows_field else (1, (False, True))
-    # Rows of a node are cases times images, once with the noise given and once without.
+    fraction, noise_cases = (1 / 6, (True,)) if model.method.knows_field else (1.0, (False, True))
+    # Rows of a node are cases times images, once with the noise given and once without. The images
+    # of a case are drawn: every sixth one would be of the same few stars, which come in turn.
     draws = [stars.draw(node, rng) for node in nodes]
     star = draws[0][1]
-    case, image = np.divmod(np.arange(0, count * len(star), step), len(star))
+    size = int(np.ceil(fraction * len(star)))
+    case = np.repeat(np.arange(count), size)
+    image = np.concatenate([np.sort(rng.permutation(len(star))[:size]) for _ in range(count)])
     is_estimated = np.repeat(noise_cases, len(case))
     case, image = np.tile(case, len(noise_cases)), np.tile(image, len(noise_cases))
     # As many nodes at a time as fit in memory.

@@ -21,7 +21,12 @@ from psfdae.methods.field.errors import excess_scatter
 from psfdae.methods.interface import Estimate, FitError
 from psfdae.photometry.crowded import _psf_doubt, photometry, star_flags
 from psfdae.stars.noise import NoiseModel
-from psfdae.training.calibration import StarErrors, fit_model_errors, fit_noise_floor
+from psfdae.training.calibration import (
+    StarErrors,
+    fit_case_scales,
+    fit_model_errors,
+    fit_noise_floor,
+)
 from psfdae.training.fitting import describe_settings, fit_method
 from psfdae.training.packing import add_wings, build_uncalibrated
 from psfdae.training.star_sets import HeldOutStars
@@ -59,6 +64,36 @@ def test_a_noise_floor_with_which_no_star_is_measured_is_not_chosen(least_floor)
     else:
         with pytest.raises(FitError, match=r"none of 1 held-out stars .* 0.001, 0.002"):
             fit_noise_floor(model, stars, 1)
+
+
+@pytest.mark.parametrize("order", ["in turn", "one after the other"])
+def test_each_case_of_the_calibration_has_images_of_most_stars(order):
+    """24 stars with six images each, in either order: a sixth of the images has 16 stars or so."""
+    number = np.arange(144) % 24 if order == "in turn" else np.arange(144) // 6
+    position = np.stack([number, np.zeros(144)], axis=1).astype(float)
+    images = np.full((144, 16, 16), 1 / 256)
+    stars = HeldOutStars(
+        images, images, NoiseModel(1.0, 1e9), position, np.zeros(144), np.zeros_like(images)
+    )
+
+    class Seen(Exception):
+        """Ends the calibration at its first prediction."""
+
+    def predict(stamps, flux, background, noise, position):
+        estimated = np.isnan(flux).astype(int) + np.isnan(background)
+        seen.update({case: len(set(position[estimated == case, 0])) for case in range(3)})
+        raise Seen
+
+    seen, nodes = {}, np.array([1e-3, 2e-3])
+    errors = ErrorModel.build_uncalibrated(nodes, np.ones((2, 16, 16)))
+    model = SimpleNamespace(
+        bundle=SimpleNamespace(errors=errors),
+        method=SimpleNamespace(knows_field=True),
+        predict=predict,
+    )
+    with pytest.raises(Seen):
+        fit_case_scales(model, stars, 1)
+    assert min(seen.values()) >= 12
 
 
 def moffat(side, x, y, ux, uy):
