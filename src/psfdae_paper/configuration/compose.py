@@ -15,8 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -261,19 +260,9 @@ def load_file(model: type[Model], path: Path, name: str | None = None) -> Model:
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
     tree = tree if isinstance(tree, dict) else {}
-    with _name_in_errors(path if name is None else f"{path}: {name}"):
-        return parse_settings(model, tree if name is None else tree[name])
-
-
-@contextmanager
-def _name_in_errors(path: Path | str) -> Iterator[None]:
-    """Begin each line of a ConfigError with the name of the file that is checked."""
-    try:
-        yield
-    except ConfigError as error:
-        # An error may have several lines, one for each key.
-        lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
-        raise ConfigError(lines) from None
+    if name is None:
+        return parse_settings(model, tree, path)
+    return parse_settings(model, tree[name], f"{path}: {name}")
 
 
 def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
@@ -321,8 +310,7 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     # A file that is not a mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
     # All groups of the file are checked: one that the stage does not read is rejected.
-    with _name_in_errors(path):
-        return _check_groups(reads, groups)
+    return _check_groups(reads, groups, path)
 
 
 def write_settings(
@@ -416,10 +404,13 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     return _check_groups(reads, groups)
 
 
-def _check_groups(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
-    """Return checked groups, annotated as a whole `Config` as in the stages."""
+def _check_groups(
+    reads: tuple[str, ...], groups: Mapping[str, Any], source: object = ""
+) -> Config:
+    """Return checked groups of a file, annotated as a whole `Config` as in the stages."""
     # `build_stage_class` makes a class of these groups alone.
-    return cast(Config, parse_settings(build_stage_class(reads, build_config_class()), groups))
+    stage_class = build_stage_class(reads, build_config_class())
+    return cast(Config, parse_settings(stage_class, groups, source))
 
 
 def select_stage_groups(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
