@@ -125,11 +125,12 @@ def dump_deciding(group: Group) -> dict[str, Any]:
     # Neutral settings are removed, group by group.
     tree = group.model_dump()
     for name, field in type(group).model_fields.items():
-        # Groups inside the group may have neutral settings as well.
+        # Groups inside the group may have neutral settings as well; a group that is left out of the
+        # tree, because it has its defaults, stays out.
         value = getattr(group, name)
         if NEUTRAL in field.metadata:
             del tree[name]
-        elif isinstance(value, Group):
+        elif isinstance(value, Group) and name in tree:
             tree[name] = dump_deciding(value)
     return tree
 
