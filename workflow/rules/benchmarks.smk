@@ -105,8 +105,6 @@ use rule figure_benchmark as posterior_network with:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/figure_posterior_network.tsv"
     params:
-        source=hash_code("workflow/benchmarks/figures.py"),
-        program=locate_program("figures.draw"),
         kind="costs",
         scene=[],
     message:
