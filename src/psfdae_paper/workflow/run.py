@@ -393,7 +393,10 @@ def import_benchmark(name: str) -> Any:
 
 
 def hash_code(*names: str) -> Callable[[Wildcards], str]:
-    """Return a parameter with the hash of commands and modules, computed where a job needs it."""
+    """Return a parameter with the hash of some code, computed where a job needs it.
+
+    Names are commands, modules, or programs such as workflow/benchmarks/costs.py.
+    """
     return lambda wildcards: source_hash(*names)
 
 
@@ -405,16 +408,6 @@ def locate_program(name: str) -> Callable[[Wildcards, int], str]:
     """
     file, command = name.split(".")
     return lambda wildcards, threads: f"{BENCHMARKS}/{file}.py {command}"
-
-
-def program_code(name: str, *stages: str) -> str:
-    """Return the hash of a program, such as "costs.cost", and of the stages that it runs."""
-    return source_hash(f"workflow/benchmarks/{name.partition('.')[0]}.py", *stages)
-
-
-def hash_program(name: str, *stages: str) -> Callable[[Wildcards], str]:
-    """Return a parameter with the hash of `program_code`, computed where a job needs it."""
-    return lambda wildcards: program_code(name, *stages)
 
 
 def stress_code() -> str:
