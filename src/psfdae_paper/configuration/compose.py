@@ -314,11 +314,7 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
 
 
 def write_settings(
-    folder: Path,
-    stage: str,
-    reads: tuple[str, ...],
-    tree: Mapping[str, Any],
-    dry: bool = False,
+    folder: Path, stage: str, reads: tuple[str, ...], tree: Mapping[str, Any], dry: bool = False
 ) -> Path:
     """Write the checked groups that a stage reads; the same settings have the same file name.
 

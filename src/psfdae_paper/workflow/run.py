@@ -22,13 +22,7 @@ from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Group, Name, parse_settings
 from psfdae.commands.cli import stage
-from psfdae_paper.configuration.compose import (
-    compose,
-    load,
-    part,
-    select_overrides,
-    write_settings,
-)
+from psfdae_paper.configuration.compose import compose, load, part, select_overrides, write_settings
 from psfdae_paper.configuration.experiment import Variant, load_experiment
 from psfdae_paper.configuration.methods import list_noise_warnings
 from psfdae_paper.configuration.schema import Config
