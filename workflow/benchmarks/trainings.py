@@ -60,7 +60,7 @@ def own_fits(config, kind, dataset, references, product, results):
     for reference in references:
         if kind.storage:
             place = results / fits.get_fit_path(kind, dataset, "random", reference)
-            fits.require(kind, place, product, config, "random", reference)
+            fits.require_fit(kind, place, product, config, "random", reference)
             by_reference[reference] = kind.load(place, reference, config.evaluation)
         else:
             data = star_sets.training_set(config, kind, product, "random", reference)
