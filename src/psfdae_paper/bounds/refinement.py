@@ -88,32 +88,31 @@ class SeidelPrior:
         fields : ndarray of int, shape (n, f)
             Fields of each star.
         """
-        count, size = fields.shape
-        directions = self.directions[fields]
-        terms = directions.shape[2]
-        # A = D M Dᵀ + 1 of all fields, as products with one M for each star.
-        weighted_directions = (directions.reshape(count, -1, len(MONOMIALS)) @ information).reshape(
+        directions, tilts = self.directions[fields], slice(-2, None)
+        # A = D M Dᵀ + 1, with D M of all fields as one product for each star.
+        flat_shape = len(point), -1, len(MONOMIALS)
+        weighted_directions = (directions.reshape(flat_shape) @ information).reshape(
             directions.shape
         )
-        curvature = weighted_directions @ directions.swapaxes(2, 3) + np.eye(terms)
-        covariance, log_determinant = invert(curvature)
-        # e = s − c⁰. A pixel's width is a tilt by half of it in λ/D: tilts that whole pixels leave,
-        # of the two offsets on either side along each axis.
-        gap = np.repeat((self.static[fields] - point[:, None])[:, :, None], 4, axis=2)
-        step = 0.5 * self.pixel
-        remainder = np.mod(gap[..., -2:], step)
-        gap[..., -2:] = remainder - step * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-        # ⟨z⟩ = A⁻¹ D (g − M e), and the logarithm of the mass.
-        curved_gap = (gap.reshape(count, -1, len(MONOMIALS)) @ information).reshape(gap.shape)
-        slope = score[:, None, None] - curved_gap
-        right_side = slope @ directions.swapaxes(2, 3)
+        curvature = weighted_directions @ directions.swapaxes(2, 3)
+        covariance, log_determinant = invert(curvature + np.eye(directions.shape[2]))
+        # e = s − c⁰. A pixel's width is a tilt by half of it in λ/D: tilts that whole pixels leave.
+        gap, step = self.static[fields] - point[:, None], 0.5 * self.pixel
+        gap[..., tilts] = np.mod(gap[..., tilts], step)
+        slope = score[:, None] - gap @ information
+        # The two offsets on either side along each axis are tilts t, e − t. Then b = D (g − M e)
+        # + D M t, and gᵀe − ½ eᵀMe grows by −tᵀ(g − M e) − ½ tᵀMt.
+        tilt = step * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        right_side = (directions @ slope[..., None]).swapaxes(2, 3)
+        right_side = right_side + tilt @ weighted_directions[..., tilts].swapaxes(2, 3)
         z = right_side @ covariance
+        log_mass = 0.5 * ((gap * (score[:, None] + slope)).sum(axis=2) - log_determinant)[..., None]
+        log_mass = log_mass - slope[..., tilts] @ tilt.T + 0.5 * (right_side * z).sum(axis=3)
+        log_mass -= 0.5 * ((tilt @ information[:, tilts, tilts]) * tilt).sum(axis=2)[:, None]
+        gap = np.repeat(gap[:, :, None], len(tilt), axis=2)
+        gap[..., tilts] -= tilt
         limited_z = np.clip(z, -self.max_abs_z, self.max_abs_z)
-        log_mass = (gap * (slope + 0.5 * curved_gap)).sum(axis=3)
-        log_mass += 0.5 * ((right_side * z).sum(axis=3) - log_determinant[:, :, None])
-        shift = (gap + limited_z @ directions).reshape(count, 4 * size, -1)
-        field_covariance = directions.swapaxes(2, 3) @ covariance @ directions
-        return Components(log_mass.reshape(count, -1), shift, field_covariance)
+        return Components(log_mass.reshape(len(point), -1), gap, limited_z, directions, covariance)
 
 
 @dataclass(frozen=True)
@@ -124,15 +123,27 @@ class Components(Rows):
     ----------
     log_mass : ndarray, shape (n, 4 f)
         Logarithms of the masses; the offsets of a field are neighbours.
-    shift : ndarray, shape (n, 4 f, 8)
-        Mean of δ in each component.
-    covariance : ndarray, shape (n, f, 8, 8)
-        Covariance of δ in each field.
+    gap : ndarray, shape (n, f, 4, 8)
+        e, which is δ for z = 0.
+    z : ndarray, shape (n, f, 4, 5)
+        Mean of z in each component.
+    directions : ndarray, shape (n, f, 5, 8)
+        Derivatives D of δ by z in each field.
+    covariance : ndarray, shape (n, f, 5, 5)
+        Covariance of z in each field.
     """
 
     log_mass: np.ndarray
-    shift: np.ndarray
+    gap: np.ndarray
+    z: np.ndarray
+    directions: np.ndarray
     covariance: np.ndarray
+
+    @cached_property
+    def shift(self) -> np.ndarray:
+        """Mean of δ in each component, (n, 4 f, 8)."""
+        shift = self.gap + self.z @ self.directions
+        return np.asarray(shift.reshape(*self.log_mass.shape, -1))
 
     @property
     def evidence(self) -> np.ndarray:
@@ -142,15 +153,21 @@ class Components(Rows):
     @property
     def mode(self) -> np.ndarray:
         """Mean of δ in the component of the largest mass, (n, 8)."""
-        return np.asarray(self.shift[np.arange(len(self.shift)), self.log_mass.argmax(axis=1)])
+        star, (field, offset) = np.arange(len(self.z)), np.divmod(self.log_mass.argmax(axis=1), 4)
+        z, directions = self.z[star, field, offset], self.directions[star, field]
+        return np.asarray(self.gap[star, field, offset] + (z[:, None] @ directions)[:, 0])
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (n, 8) and covariance (n, 8, 8) of δ under the mixture."""
         weight = np.exp(self.log_mass - self.evidence[:, None])
         mean = np.einsum("nk,nka->na", weight, self.shift)
         # Within the components, and between their means.
-        of_field = weight.reshape(len(weight), -1, 4).sum(axis=2)
-        covariance = np.einsum("nf,nfab->nab", of_field, self.covariance)
+        of_field = weight.reshape(len(weight), -1, 4).sum(axis=2)[..., None, None]
+        slopes, scatter = (
+            array.reshape(len(array), -1, array.shape[-1])
+            for array in (self.directions, of_field * self.covariance @ self.directions)
+        )
+        covariance = slopes.swapaxes(1, 2) @ scatter
         offsets = (self.shift - mean[:, None]) * np.sqrt(weight)[:, :, None]
         return mean, covariance + offsets.swapaxes(1, 2) @ offsets
 
