@@ -30,10 +30,10 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from psfdae.base.rows import Rows
-from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
+from psfdae.optics.derivatives import ImageSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.pupil import annular_pupil, choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
-from psfdae.sensing.climbing import group_maximum, poisson_information
+from psfdae.sensing.climbing import Evaluation, group_maximum, poisson_information
 from psfdae.stars.noise import NoiseModel
 from psfdae_paper.bounds.posterior_network import (
     PosteriorNetwork,
@@ -113,6 +113,33 @@ class SeidelPrior:
         gap[..., tilts] -= tilt
         limited_z = np.clip(z, -self.max_abs_z, self.max_abs_z)
         return Components(log_mass.reshape(len(point), -1), gap, limited_z, directions, covariance)
+
+    def find_fields(
+        self, point: np.ndarray, score: np.ndarray, information: np.ndarray, number: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the most likely fields among all; for the arguments see `condition`.
+
+        Returns
+        -------
+        evidence : ndarray, shape (n,)
+            Logarithm of the mass in all fields.
+        mode : ndarray, shape (n, 8)
+            Mean of δ in the component of the largest mass.
+        fields : ndarray of int, shape (n, number)
+            Fields with the largest masses, each by its best offset.
+        """
+        size = len(self.field)
+        number, every_field, parts = min(number, size), np.arange(size), []
+        # A few stars at a time, whose components stay in the cache of the processor.
+        for first in range(0, max(len(point), 1), 32):
+            rows = slice(first, first + 32)
+            fields = np.broadcast_to(every_field, (len(point[rows]), size))
+            components = self.condition(point[rows], score[rows], information[rows], fields)
+            log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
+            likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
+            parts.append((components.evidence, components.mode, likely))
+        evidence, mode, likely = map(np.concatenate, zip(*parts, strict=True))
+        return evidence, mode, likely
 
 
 @dataclass(frozen=True)
@@ -353,7 +380,7 @@ class Refiner:
         return SampledStamps(
             self.obscuration,
             monomial_images,
-            PointSampling,
+            ImageSampling,
             self.stamp_px,
             self.prior.pixel,
             "complex64",
@@ -361,15 +388,10 @@ class Refiner:
             batch=32 * len(MONOMIALS),
         )
 
-    def expand(
-        self,
-        point: np.ndarray,
-        counts: np.ndarray,
-        flux: np.ndarray,
-        fields: np.ndarray,
-        damping: np.ndarray | float = 0.0,
-    ) -> Expansion:
-        """Expand the posteriors of n stars about wavefronts.
+    def measure(
+        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, Evaluation]:
+        """Propagate the stamps of n wavefronts, and compare them with photons.
 
         Parameters
         ----------
@@ -379,11 +401,13 @@ class Refiner:
             Photons in every pixel, sky included.
         flux : ndarray, shape (n,)
             Photons F of each star.
-        fields : ndarray of int, shape (n, f)
-            Fields that are considered for each star.
-        damping : ndarray, shape (n, 8, 8)
-            Inverse covariance of a normal distribution about the points, another factor of the
-            posterior.
+
+        Returns
+        -------
+        stamps, slopes : ndarray, shapes (n, P) and (n, 8, P)
+            Stamps of sum 1, and their derivatives by c.
+        likelihood : Evaluation
+            −2 ln L(c⁰), g and M.
         """
         axes = np.broadcast_to(np.eye(len(MONOMIALS)), (len(point), *[len(MONOMIALS)] * 2))
         # The count of samples holds for the steepest slopes, which few rays have.
@@ -394,12 +418,16 @@ class Refiner:
         stamps = stamps.reshape(len(point), -1).astype(np.float64)
         slopes = slopes.reshape(len(point), len(MONOMIALS), -1).astype(np.float64)
         # Poisson likelihood of the counts, of mean F p + B.
-        deviance, score, information = poisson_information(
-            counts,
-            flux[:, None] * stamps + self.noise.background,
-            flux[:, None, None] * slopes,
-        )
-        components = self.prior.condition(point, score, information + damping, fields)
+        mean_counts = flux[:, None] * stamps + self.noise.background
+        likelihood = poisson_information(counts, mean_counts, flux[:, None, None] * slopes)
+        return stamps, slopes, likelihood
+
+    def expand(
+        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
+    ) -> Expansion:
+        """Expand posteriors about wavefronts in the fields (n, f) of each; see `measure`."""
+        stamps, slopes, (deviance, *slope_and_curvature) = self.measure(point, counts, flux)
+        components = self.prior.condition(point, *slope_and_curvature, fields)
         return Expansion(point, stamps, slopes, deviance, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
@@ -563,15 +591,10 @@ class Refiner:
         fields : ndarray of int, shape (n, f)
             The most likely fields.
         """
-        every_field = np.arange(len(self.prior.field))
-        fields = np.broadcast_to(every_field, (len(point), every_field.size))
-        expansion = self.expand(point, counts, flux, fields, damping)
-        components = expansion.components
-        # The most likely fields, by the best offset of each.
-        log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
-        number = min(self.fields_kept, every_field.size)
-        likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
-        return expansion.evidence, point + components.mode, likely
+        *_, (deviance, score, information) = self.measure(point, counts, flux)
+        likely = self.prior.find_fields(point, score, information + damping, self.fields_kept)
+        evidence, step, fields = likely
+        return evidence - 0.5 * deviance, point + step, fields
 
 
 def list_partners(group: np.ndarray) -> Iterator[np.ndarray]:
