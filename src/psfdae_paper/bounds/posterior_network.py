@@ -659,44 +659,13 @@ class WavefrontNetwork(FeatureNetwork):
         self, noisy: torch.Tensor, level: torch.Tensor, matrices: Matrices | None = None
     ) -> Proposals:
         """Map noisy images (n, P) of levels (n,) to wavefronts; see `PosteriorNetwork.forward`."""
-        views = self.compute_views(noisy, level, matrices or self.matrices())
-        with torch.autocast("cpu", enabled=False):
-            return self.average(torch.einsum("gnw,kvw->gnkv", views, self.output))
-
-    def compute_views(
-        self, noisy: torch.Tensor, level: torch.Tensor, matrices: Matrices
-    ) -> torch.Tensor:
-        """Return features (G, n, width) of images; g has seen the star that it moves to one."""
         total = self.variance + self.compute_variance(level)
         inputs = ((noisy - self.mean) @ self.axes) / total.sqrt()
-        features = self.compute_features(inputs, level, matrices)
+        features = self.compute_features(inputs, level, matrices or self.matrices())
+        # The feature of a symmetry g has seen the star that g moves to the image.
         with torch.autocast("cpu", enabled=False):
-            return torch.einsum("rg,rnw->gnw", self.waves, features.float())
-
-    @torch.no_grad()
-    def fit_means(self, noisy: torch.Tensor, level: torch.Tensor, wavefront: torch.Tensor) -> None:
-        """Add the linear map from features to wavefronts of least squared error to all Gaussians.
-
-        Parameters
-        ----------
-        noisy, level : Tensor, shapes (n, P) and (n,)
-            Images and their levels.
-        wavefront : Tensor, shape (n, 8)
-            Standardised coordinates.
-        """
-        # Means over the symmetries (`average`) are linear in the weights of the last layer.
-        views = self.compute_views(noisy, level, self.matrices())
-        design = torch.einsum("gab,gnw->nabw", self.mirrors, views).flatten(0, 1).flatten(1)
-        design /= len(views)
-        # Ridge regression: features that hardly vary get small weights.
-        gram = design.T @ design
-        gram.diagonal().add_(1e-4 * gram.diagonal().mean())
-        weights = torch.linalg.solve(gram, design.T @ wavefront.flatten())
-        self.output[:, 1 : 1 + len(wavefront.T)] += weights.view(len(wavefront.T), -1)
-
-    def standardise(self, wavefront: torch.Tensor) -> torch.Tensor:
-        """Return coordinates (n, 8) in waves with mean 0 and standard deviation 1."""
-        return (wavefront - self.coordinate_mean) / self.coordinate_sd
+            views = torch.einsum("rg,rnw->gnw", self.waves, features.float())
+            return self.average(torch.einsum("gnw,kvw->gnkv", views, self.output))
 
     def average(self, values: torch.Tensor) -> Proposals:
         """Return the means over the symmetries of proposals (G, n, K, ·), each as it has seen."""
@@ -844,22 +813,16 @@ class PosteriorNetworkTraining(Training):
         while self.sets <= epoch:
             new = FreshStars.simulate(self.config, self.sets, self.settings.stars, self.fields)
             self.stars, self.sets = self.stars.add(new), self.sets + 1
-        rng = self.stream("epoch", epoch)
+        rng, levels = self.stream("epoch", epoch), self.data.levels
         for _ in range(self.steps):
-            stamps, *places = self.stars.draw(self.settings.batch, rng)
-            noise = self.draw_noisy(stamps, rng)
-            arrays = (stamps, *noise, *(values.astype(np.float32) for values in places))
+            stamps, position, wavefront = self.stars.draw(self.settings.batch, rng)
+            number = rng.integers(len(levels), size=len(stamps))
+            # Laws with correlated pixels need images.
+            images = stamps.reshape(-1, *self.data.images.shape[1:])
+            noisy = self.data.noise.draw_gaussian(images, levels[number], rng)
+            noisy, places = noisy.reshape(stamps.shape), (position, wavefront)
+            arrays = (stamps, noisy, number, *(values.astype(np.float32) for values in places))
             yield tuple(map(torch.from_numpy, arrays))
-
-    def draw_noisy(
-        self, stamps: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return noisy images of stamps (n, P), and the numbers (n,) of their random levels."""
-        number = rng.integers(len(self.data.levels), size=len(stamps))
-        # Laws with correlated pixels need images.
-        images = stamps.reshape(-1, *self.data.images.shape[1:])
-        noisy = self.data.noise.draw_gaussian(images, self.data.levels[number], rng)
-        return noisy.reshape(stamps.shape), number
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the mean over stars of the squared error over the latest errors of its level.
@@ -975,19 +938,15 @@ class WavefrontTraining(PosteriorNetworkTraining):
     def build(
         self, stars: DrawnStars, settings: PosteriorNetworkSettings, uses_position: bool
     ) -> nn.Module:
-        """Return a network with the features of the earlier one, and a linear map from them."""
-        model = WavefrontNetwork.begin(self.network, stars.wavefront, self.stream("wavefront"))
-        stamps, wavefront = stars.stamps[:8000], stars.wavefront[:8000].astype(np.float32)
-        noisy, number = self.draw_noisy(stamps, self.stream("linear map"))
-        scaled_wavefront = model.standardise(torch.from_numpy(wavefront))
-        model.fit_means(torch.from_numpy(noisy), self.levels[number], scaled_wavefront)
-        return model
+        """Return a network with the features of the earlier one."""
+        return WavefrontNetwork.begin(self.network, stars.wavefront, self.stream("wavefront"))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Return the mean over stars of −ln of the probability of their wavefronts."""
         _, noisy, number, _, wavefront = batch
+        scaled_wavefront = (wavefront - self.model.coordinate_mean) / self.model.coordinate_sd
         proposals = self.model(noisy, self.levels[number])
-        loss: torch.Tensor = -proposals.log_density(self.model.standardise(wavefront)).mean()
+        loss: torch.Tensor = -proposals.log_density(scaled_wavefront).mean()
         return loss
 
     def validate(self, epoch: int) -> float:

@@ -33,8 +33,14 @@ from psfdae.base.rows import Rows
 from psfdae.optics.derivatives import ImageSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.pupil import annular_pupil, choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
-from psfdae.sensing.climbing import Evaluation, group_maximum, poisson_information
+from psfdae.sensing.climbing import (
+    Evaluation,
+    compute_deviance_limit,
+    group_maximum,
+    poisson_information,
+)
 from psfdae.stars.noise import NoiseModel
+from psfdae_paper.bounds.modes import rank_in_group
 from psfdae_paper.bounds.posterior_network import (
     PosteriorNetwork,
     WavefrontCoordinates,
@@ -298,8 +304,32 @@ class NetworkStarts(NamedTuple):
         points = WavefrontCoordinates.decode(wavefront, pixel)
         return cls(points, precision, np.exp(log_weight), psf, sigma**2)
 
+    def scatter(self, stars: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return all K wavefronts of stars (n,), and draws around them, star after star.
 
-class RefinedPsfs(NamedTuple):
+        A draw is limited to errors of the coefficients of half a wave.
+
+        Returns
+        -------
+        points : ndarray, shape (n K (1 + draws), 8)
+            Coefficients.
+        precision : ndarray, shape (n K (1 + draws), 8, 8)
+            Inverse covariances of their errors.
+        """
+        points, precision = self.points[stars, :, None], self.precision[stars, :, None]
+        size = points.shape[-1]
+        # μ + L⁻ᵀ u with the precision L Lᵀ; the same normal u for all stars, which do not depend on
+        # each other in this way.
+        root = np.linalg.cholesky(precision + 4.0 * np.eye(size))
+        normal = np.random.default_rng(0).standard_normal((points.shape[1], draws, size, 1))
+        drawn_points = points + np.linalg.solve(root.swapaxes(-1, -2), normal)[..., 0]
+        all_points = np.concatenate([points, drawn_points], axis=2)
+        all_precisions = np.broadcast_to(precision, (*all_points.shape, size))
+        return all_points.reshape(-1, size), all_precisions.reshape(-1, size, size)
+
+
+@dataclass(frozen=True)
+class RefinedPsfs(Rows):
     """Posterior means of n stars about their refined wavefronts.
 
     Attributes
@@ -347,6 +377,10 @@ class Refiner:
     max_gap : float
         Difference in the logarithm of the evidence of first expansions, below which a proposal is
         refined.
+    draws : int
+        Draws around each proposal of a star that the likely ones do not explain.
+    search_steps : int
+        Damped steps from these draws.
     fields_kept : int
         Fields that expansions after the first one consider, the most likely of the first.
     batch : int
@@ -364,6 +398,8 @@ class Refiner:
     max_proposals: ClassVar[int] = 8
     min_weight: ClassVar[float] = 0.05
     max_gap: ClassVar[float] = 6.0
+    draws: ClassVar[int] = 2
+    search_steps: ClassVar[int] = 3
     fields_kept: ClassVar[int] = 24
     batch: ClassVar[int] = 128
     sampling: ClassVar[float] = 0.85
@@ -434,7 +470,7 @@ class Refiner:
         """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
 
         Proposals are tried up to a total probability, and refined unless the first expansion of
-        another one has much more evidence.
+        another one has much more evidence. A star that no wavefront explains is searched anew.
         """
         count, pixels = len(noisy), self.stamp_px**2
         flux = self.noise.flux(level)
@@ -442,7 +478,7 @@ class Refiner:
         images = noisy.reshape(count, pixels).astype(np.float64)
         counts = np.rint(flux[:, None] * images) + self.noise.background
         psf, variance = np.zeros((2, count, pixels))
-        evidence = np.full(count, -np.inf)
+        results = RefinedPsfs(psf, variance, np.full(count, -np.inf))
         # Proposals that are preceded by less than the total probability.
         is_likely = np.cumsum(starts.weight, axis=1) - starts.weight < 1.0 - self.min_weight
         is_likely[:, self.max_proposals :] = False
@@ -450,21 +486,68 @@ class Refiner:
             star, number = np.nonzero(is_likely[first : first + self.batch])
             star += first
             start = starts.points[star, number], self.damping * starts.precision[star, number]
-            first_evidence, point, likely_fields = self.begin(*start, counts[star], flux[star])
-            # Near the best start of a star no other one is needed, nor with much less evidence.
-            order = np.lexsort((-first_evidence, star))
-            star, point, likely_fields = star[order], point[order], likely_fields[order]
-            gap = group_maximum(first_evidence[order], star) - first_evidence[order]
-            is_used = self.find_distinct(star, point) & (gap <= self.max_gap)
-            starting = star[is_used], point[is_used], likely_fields[is_used]
-            star, expansion = self.follow(*starting, counts, flux)
-            # Means over the wavefronts of a star, with their posterior probabilities.
-            np.logaddexp.at(evidence, star, expansion.evidence)
-            weight = np.exp(expansion.evidence - evidence[star])[:, None]
-            mean, scatter = expansion.moments()
-            np.add.at(psf, star, weight * mean)
-            np.add.at(variance, star, weight * (scatter + (mean - psf[star]) ** 2))
-        return RefinedPsfs(psf, variance, evidence)
+            results.put(*self.climb(star, *start, counts, flux, steps=1))
+        # χ² of stars that none of their wavefronts explains is too large. They are searched in
+        # several steps, from all proposals and from draws of their Gaussians.
+        mean_counts = flux[:, None] * psf + self.noise.background
+        chi2 = (np.square(counts - mean_counts) / np.maximum(mean_counts, 1.0)).sum(axis=1)
+        unexplained = np.flatnonzero(chi2 > compute_deviance_limit(pixels))
+        for first in range(0, len(unexplained), self.batch // 8):
+            stars = unexplained[first : first + self.batch // 8]
+            points, damping = starts.scatter(stars, self.draws)
+            star = np.repeat(stars, len(points) // len(stars))
+            start = points, self.damping * damping
+            results.put(*self.climb(star, *start, counts, flux, steps=self.search_steps))
+        return results
+
+    def climb(
+        self,
+        star: np.ndarray,
+        point: np.ndarray,
+        damping: np.ndarray,
+        counts: np.ndarray,
+        flux: np.ndarray,
+        steps: int,
+    ) -> tuple[np.ndarray, RefinedPsfs]:
+        """Return the numbers (m,) of stars, and their posterior means from starts.
+
+        Parameters
+        ----------
+        star : ndarray of int, shape (n,)
+            Stars of the starts.
+        point, damping : ndarray, shapes (n, 8) and (n, 8, 8)
+            Coefficients, and inverse covariances that limit a step.
+        counts, flux : ndarray, shapes (N, P) and (N,)
+            Photons of all stars; see `measure`.
+        steps : int
+            Damped steps, after each of which the most likely wavefronts are kept.
+        """
+        for step in range(steps):
+            evidence, point, fields = self.begin(point, damping, counts[star], flux[star])
+            # Near the best wavefront of a star no other one is needed, nor with much less evidence.
+            order = np.lexsort((-evidence, star))
+            star, evidence, point, damping, fields = (
+                array[order] for array in (star, evidence, point, damping, fields)
+            )
+            is_used = self.find_distinct(star, point)
+            if step + 1 < steps:
+                is_used &= rank_in_group(star, -evidence) < self.max_proposals
+            else:
+                is_used &= group_maximum(evidence, star) - evidence <= self.max_gap
+            star, point, damping, fields = (
+                array[is_used] for array in (star, point, damping, fields)
+            )
+        star, expansion = self.follow(star, point, fields, counts, flux)
+        # Means over the wavefronts of a star, with their posterior probabilities.
+        stars, number = np.unique(star, return_inverse=True)
+        evidence = np.full(len(stars), -np.inf)
+        np.logaddexp.at(evidence, number, expansion.evidence)
+        weight = np.exp(expansion.evidence - evidence[number])[:, None]
+        mean, scatter = expansion.moments()
+        psf, variance = np.zeros((2, len(stars), counts.shape[1]))
+        np.add.at(psf, number, weight * mean)
+        np.add.at(variance, number, weight * (scatter + (mean - psf[number]) ** 2))
+        return stars, RefinedPsfs(psf, variance, evidence)
 
     @cached_property
     def root(self) -> np.ndarray:

@@ -75,9 +75,9 @@ def test_derivatives_from_the_image_are_those_of_propagated_products(samples):
     pupil, pixel = annular_pupil(samples, 0.3), 0.88
     coefficients = np.stack([0.2 * COMATIC, -0.1 * COMATIC])
     (stamps, slopes), (same_stamps, from_image) = (
-        ModalStamps(
-            pupil, monomial_images, kind(pupil, 16, pixel, "complex64"), pixel
-        ).derivatives(coefficients, np.eye(8)[None])
+        ModalStamps(pupil, monomial_images, kind(pupil, 16, pixel, "complex64"), pixel).derivatives(
+            coefficients, np.eye(8)[None]
+        )
         for kind in (PointSampling, ImageSampling)
     )
     assert same_stamps == pytest.approx(stamps, abs=1e-6 * float(stamps.max()))

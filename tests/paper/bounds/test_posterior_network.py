@@ -108,23 +108,6 @@ def test_coordinates_that_do_not_vary_are_standardised_to_0():
     assert scaled[:, 3].std() == pytest.approx(1.0)
 
 
-def test_means_of_wavefronts_begin_with_the_linear_map_from_features(monkeypatch):
-    """Where the wavefronts are such a map, it is found."""
-    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
-    rng, stamps = np.random.default_rng(12), np.random.default_rng(11).random((1000, 8, 8))
-    network = build(stamps / stamps.sum(axis=(1, 2), keepdims=True))
-    proposer = WavefrontNetwork.begin(network, rng.standard_normal((50, 8)), rng)
-    noisy = torch.from_numpy(rng.random((1000, 64)).astype(np.float32)) / 32
-    level = torch.full((1000,), 2e-3)
-    with torch.no_grad():
-        expected = proposer(noisy, level).mean[:, 0]
-        proposer.output.zero_()
-        proposer.fit_means(noisy, level, expected)
-        means = proposer(noisy, level).mean
-    assert expected.std() > 0.01
-    assert (means - expected[:, None]).abs().max() < 0.05 * expected.std()
-
-
 def test_estimates_have_the_sum_1():
     rng = np.random.default_rng(4)
     stamps = rng.random((300, 8, 8))
