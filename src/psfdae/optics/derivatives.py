@@ -14,7 +14,7 @@ There are four ways from the pupil to the pixels, each of them a `propagation.Sa
 - `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
   narrower than the image's period;
 - `ImageSampling`: the same points; derivatives from the field in the image, with an error of 2e-4
-  in a third of the time;
+  in half of the time or less;
 - `PeriodSampling`: the whole period of the image by a Fourier transform. The
   intensity is a trigonometric polynomial, which its samples determine, so pixels
   are integrated exactly. It is faster for stamps nearly as wide as the period;

@@ -377,8 +377,10 @@ class Refiner:
     max_gap : float
         Difference in the logarithm of the evidence of first expansions, below which a proposal is
         refined.
+    misfit_sigma : float
+        Excess of χ² in standard deviations, above which a star is not explained by its wavefronts.
     draws : int
-        Draws around each proposal of a star that the likely ones do not explain.
+        Draws around each proposal of such a star.
     search_steps : int
         Damped steps from these draws.
     fields_kept : int
@@ -398,6 +400,7 @@ class Refiner:
     max_proposals: ClassVar[int] = 8
     min_weight: ClassVar[float] = 0.05
     max_gap: ClassVar[float] = 6.0
+    misfit_sigma: ClassVar[float] = 4.0
     draws: ClassVar[int] = 2
     search_steps: ClassVar[int] = 3
     fields_kept: ClassVar[int] = 24
@@ -462,8 +465,8 @@ class Refiner:
         self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
     ) -> Expansion:
         """Expand posteriors about wavefronts in the fields (n, f) of each; see `measure`."""
-        stamps, slopes, (deviance, *slope_and_curvature) = self.measure(point, counts, flux)
-        components = self.prior.condition(point, *slope_and_curvature, fields)
+        stamps, slopes, (deviance, score, information) = self.measure(point, counts, flux)
+        components = self.prior.condition(point, score, information, fields)
         return Expansion(point, stamps, slopes, deviance, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
@@ -491,7 +494,8 @@ class Refiner:
         # several steps, from all proposals and from draws of their Gaussians.
         mean_counts = flux[:, None] * psf + self.noise.background
         chi2 = (np.square(counts - mean_counts) / np.maximum(mean_counts, 1.0)).sum(axis=1)
-        unexplained = np.flatnonzero(chi2 > compute_deviance_limit(pixels))
+        limit = compute_deviance_limit(pixels, self.misfit_sigma)
+        unexplained = np.flatnonzero(chi2 > limit)
         for first in range(0, len(unexplained), self.batch // 8):
             stars = unexplained[first : first + self.batch // 8]
             points, damping = starts.scatter(stars, self.draws)
@@ -675,8 +679,9 @@ class Refiner:
             The most likely fields.
         """
         *_, (deviance, score, information) = self.measure(point, counts, flux)
-        likely = self.prior.find_fields(point, score, information + damping, self.fields_kept)
-        evidence, step, fields = likely
+        evidence, step, fields = self.prior.find_fields(
+            point, score, information + damping, self.fields_kept
+        )
         return evidence - 0.5 * deviance, point + step, fields
 
 
