@@ -137,14 +137,14 @@ class SeidelPrior:
         size = len(self.field)
         number, every_field, parts = min(number, size), np.arange(size), []
         # A few stars at a time, whose components stay in the cache of the processor.
-        for first in range(0, max(len(point), 1), 32):
+        for first in range(0, len(point), 32):
             rows = slice(first, first + 32)
             fields = np.broadcast_to(every_field, (len(point[rows]), size))
             components = self.condition(point[rows], score[rows], information[rows], fields)
             log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
             likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
             parts.append((components.evidence, components.mode, likely))
-        evidence, mode, likely = map(np.concatenate, zip(*parts, strict=True))
+        evidence, mode, likely = (np.concatenate(column) for column in zip(*parts, strict=True))
         return evidence, mode, likely
 
 
