@@ -283,7 +283,7 @@ def correlate_errors(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
     matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    # The interval is undefined for fewer than four samples.
+    # The interval, 1.96 σ to either side, is undefined for fewer than four samples.
     low, high = compute_fisher_interval(matrix, count, 1.959963984540054)
     if count < 4:
         off_diagonal = ~np.eye(len(matrix), dtype=bool)
