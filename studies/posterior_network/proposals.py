@@ -47,13 +47,13 @@ def main(dataset, level, place):
     only = np.zeros((STARS, 1, 8, 8)), np.ones((STARS, 1)), starts.psf, starts.variance
     from_truth, expansions = NetworkStarts(truth[:, None], *only), []
     # Count the stars of all expansions.
-    expand = Refiner.expand
+    measure = Refiner.measure
 
     def count(self, point, *arrays):
         expansions.append(len(point))
-        return expand(self, point, *arrays)
+        return measure(self, point, *arrays)
 
-    Refiner.expand = count
+    Refiner.measure = count
     writer = csv.writer(sys.stdout)
     writer.writerow(["max_proposals", "min_weight", "max_gap", "expansions", "mse", "median"])
     for rule, start in [*((rule, starts) for rule in RULES), (("truth", 0, 0), from_truth)]:
@@ -67,7 +67,7 @@ def main(dataset, level, place):
     flux = refiner.noise.flux(levels)
     counts = np.rint(flux[:, None] * noisy.reshape(STARS, -1)) + refiner.noise.background
     every_field = np.broadcast_to(np.arange(fields.size), (STARS, fields.size))
-    _, covariance = expand(refiner, truth, counts, flux, every_field).components.moments()
+    _, covariance = refiner.expand(truth, counts, flux, every_field).components.moments()
     # Error of a coefficient if all others are known, over its error.
     precision = np.linalg.inv(covariance + 1e-12 * np.eye(8))
     ratio = 1.0 / np.sqrt(np.einsum("nii,nii->ni", covariance, precision))

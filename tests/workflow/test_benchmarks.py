@@ -46,7 +46,7 @@ def test_peers_converge_to_our_stamp_with_their_subsamples(case, method):
     def error(subsamples):
         setting = propagators.Setting(method, case.samples, subsamples)
         _, propagate = propagators.build(case, setting)
-        return scenes.relative_to_peak(propagate(), case.truth)
+        return scenes.compare_to_peak(propagate(), case.truth)
 
     coarse, fine = error(4), error(8)
     assert fine < 2.5e-3
@@ -62,7 +62,7 @@ def test_configured_optics_stay_within_the_error_budget(dataset, worst_stars):
     scene = scenes.Scene.of(load_stage(scenes.READS, [f"dataset={dataset}"]))
     selection = scenes.Selection(scene.stars, np.array(worst_stars))
     stamps, offset = scene.propagation(selection, scene.search_px).frame(scene.framing.stamp_px)
-    exact = scenes.stamps_at(scene, selection, offset, *scenes.REFERENCES[-1])
+    exact = scenes.simulate_stamps(scene, selection, offset, *scenes.REFERENCES[-1])
     assert scenes.stamp_mse(normalise_flux(stamps)[0], exact).max() <= scene.budget
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from measure import isolated, pareto, write
+from measure import isolate, pareto, write
 from psfdae.base.belonging import STARS, require
 from psfdae.base.files import read_product
 from psfdae.base.options import File
@@ -86,7 +86,7 @@ def cost(
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
     knows_position = method_class(name).needs.position
     bound, is_tight = least_errors(read_table(bounds), dataset, knows_position)
-    row = isolated(1, time_method, name, config.model_dump(), stars, bound)
+    row = isolate(1, time_method, name, config.model_dump(), stars, bound)
     key = {"dataset": dataset, "method": name, "point": point}
     write(out, [{**key, **row, "tight": "yes" if is_tight else "no"}])
 

@@ -30,7 +30,7 @@ def tv(image, sigma, strength):
     return denoise_tv_chambolle(image, strength)
 
 
-def denoised(denoise, noisy, sigma, strength):
+def denoise_images(denoise, noisy, sigma, strength):
     """Images (n, d, d) denoised at a strength; `sigma` is the noise of a sky pixel."""
     # The functions have absolute tolerances, made for images between 0 and 1.
     peak = float(np.abs(noisy).max()) or 1.0
@@ -68,7 +68,7 @@ class Denoisers(Method):
             noisy = data.noise.draw(images, level, stream(data.seed, "denoisers", f"{level:.6g}"))
             errors = {
                 (denoise, strength): mse(
-                    denoised(denoise, noisy, data.noise.kappa * level, strength), references
+                    denoise_images(denoise, noisy, data.noise.kappa * level, strength), references
                 ).mean()
                 for denoise in functions
                 for strength in 2.0 ** np.arange(-2.0, 2.25, 0.5)
@@ -79,4 +79,4 @@ class Denoisers(Method):
     def predict(self, noisy, level):
         """Denoise images (n, d, d) of one noise level λ of the training."""
         denoise, strength = self.choices[level]
-        return denoised(denoise, noisy, self.noise.kappa * level, strength)
+        return denoise_images(denoise, noisy, self.noise.kappa * level, strength)

@@ -79,7 +79,7 @@ def draw(
     write_png(apply_style(globals()[kind])(rows), out)
 
 
-def labelled(axes, x, y, text, shift=3, **style):
+def label_point(axes, x, y, text, shift=3, **style):
     """A small text beside a point."""
     place = {"xytext": (shift, 4), "textcoords": "offset points", "fontsize": 7}
     axes.annotate(text, (x, y), **place, **style)
@@ -189,7 +189,7 @@ def draw_method(fit_axes, star_axes, points, look):
     for name, rows in marked.items():
         fit_axes.plot(points["fit_cpu_s"][rows], points["over_least"][rows], **MARKS[name][1])
     for row in lengths[lengths["point"].str.startswith("epochs")].itertuples():
-        labelled(fit_axes, row.fit_cpu_s, row.over_least, row.point.removeprefix("epochs"), 6)
+        label_point(fit_axes, row.fit_cpu_s, row.over_least, row.point.removeprefix("epochs"), 6)
 
 
 def inference(table):

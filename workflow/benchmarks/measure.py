@@ -32,7 +32,7 @@ def time_in_rounds(builders, repeats):
 
     A machine that others share is slower for seconds at a time; rounds spread the repeats of
     every callable over the whole run. Builders set up what is timed and warm it up, anew in
-    every round. Processes that run side by side (see `isolated`) begin every timing together.
+    every round. Processes that run side by side (see `isolate`) begin every timing together.
     """
     return np.array([[_timed(build()) for build in builders] for _ in range(repeats)]).T
 
@@ -50,7 +50,7 @@ def _meet(barrier):
     _BARRIERS.append(barrier)
 
 
-def isolated(threads, function, *arguments, processes=1):
+def isolate(threads, function, *arguments, processes=1):
     """Results of a module's function in interpreters of their own with so many threads.
 
     That of one process as it is, those of several that run side by side as a list.
@@ -68,7 +68,7 @@ def isolated(threads, function, *arguments, processes=1):
     return results if processes > 1 else results[0]
 
 
-def cost_of_command(words, out, tree=None):
+def measure_command(words, out, tree=None):
     """Return the cost of a command of psfdae in this process, run as users run it.
 
     `words` are its name and options but for `--out`, `tree` the configuration that its groups

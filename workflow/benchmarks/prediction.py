@@ -14,7 +14,7 @@ from typing import Annotated
 import click
 import numpy as np
 
-from measure import cost_of_command, isolated, write, yes
+from measure import isolate, measure_command, write, yes
 from psfdae.base.belonging import STARS, require
 from psfdae.base.files import read_product
 from psfdae.base.options import File
@@ -65,8 +65,8 @@ def throughput(
     work = (settings.star_counts[-1], settings.threads, min(settings.repeats, REPEATS))
     with TemporaryDirectory() as folder:
         cube = Path(folder, "stars.fits")
-        isolated(1, make_cube, config.model_dump(), stars, work[0], cube)
-        rates, peak_mb = isolated(settings.threads, time_prediction, cube, bundle, mixture, *work)
+        isolate(1, make_cube, config.model_dump(), stars, work[0], cube)
+        rates, peak_mb = isolate(settings.threads, time_prediction, cube, bundle, mixture, *work)
     bare = max(rates["bare_shared_per_s"], rates["bare_parallel_per_s"])
     share = rates["predict_per_s"] / bare
     row = {"stamps": work[0], "stamp_px": config.framing.stamp_px, "threads": work[1]}
@@ -110,19 +110,19 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
     rates = {"bare_shared": [], "bare_parallel": [], "predict": []}
     for _ in range(repeats):
-        cost = cost_of_command(["predict", cube, *options], cube.with_name("psf.fits"))
+        cost = measure_command(["predict", cube, *options], cube.with_name("psf.fits"))
         peak = max(peak, cost["peak_b"])
         rates["predict"].append(stamps / cost["time_s"])
         for way in ("shared", "parallel"):
-            rates[f"bare_{way}"].append(bare_rate(model, stamps, threads, way))
+            rates[f"bare_{way}"].append(time_network(model, stamps, threads, way))
     options[1] = mixture
-    cost = cost_of_command(["predict", cube, *options], cube.with_name("psf.fits"))
+    cost = measure_command(["predict", cube, *options], cube.with_name("psf.fits"))
     peak, rates["mixture"] = max(peak, cost["peak_b"]), [stamps / cost["time_s"]]
     medians = {f"{name}_per_s": np.median(values) for name, values in rates.items()}
     return medians, peak / 2**20
 
 
-def bare_rate(model, stamps, threads, way):
+def time_network(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
@@ -185,8 +185,8 @@ def bundle_errors(bundle, truth, config):
         estimated = model.predict(stamps, gain=1.0)
         row = {"bundle": model.info.name, "method": model.info.method, "noise_level": level}
         row |= {"snr": tested["snr"], "stars": len(truth), "mse_table": tested["mse"]}
-        row |= quality(prediction, truth, flux, tested["mse"], "given")
-        row |= quality(estimated, truth, flux, tested["mse"], "estimated")
+        row |= summarise_errors(prediction, truth, flux, tested["mse"], "given")
+        row |= summarise_errors(estimated, truth, flux, tested["mse"], "estimated")
         row["lost"] = np.isnan(estimated.psf).any(axis=(1, 2)).sum()
         row["allowed_ratio"] = ALLOWED_RATIO
         yield row | {"met": yes(abs(row["ratio_given"] - 1.0) <= ALLOWED_RATIO)}
@@ -201,7 +201,7 @@ def require_bundle(bundle, config):
         require(bundle, trained_on, STARS, config)
 
 
-def quality(result, truth, flux, expected, case):
+def summarise_errors(result, truth, flux, expected, case):
     """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty.
 
     `coverage95` is of `UNCERT` times `ratio95`.
@@ -239,7 +239,7 @@ def coverage(
         bundle = read_bundle(path)
         matching = (p for p in products if p.config == bundle.info.config["stars"])
         product = next(matching, None) or refuse(path, stars)
-        rows += covered(bundle, product, config.seed)
+        rows += tabulate_coverage(bundle, product, config.seed)
     write(out, rows)
 
 
@@ -248,7 +248,7 @@ def refuse(bundle, stars):
     raise ConfigError(f"{bundle}: was trained on other stars than {', '.join(map(str, stars))}")
 
 
-def covered(bundle, product, seed):
+def tabulate_coverage(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
     from psfdae.api import PsfModel
     from psfdae.denoise.bundle import estimator

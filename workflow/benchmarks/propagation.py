@@ -3,14 +3,14 @@
 from dataclasses import replace
 from typing import Annotated, Any
 
-from measure import isolated, machine, write
+from measure import isolate, machine, write
 from propagators import (
     compare,
     configured_setting,
-    finish,
-    in_processes,
     kernel_settings,
-    peers_of,
+    list_peers,
+    mark_pareto_fronts,
+    time_in_processes,
     time_settings,
 )
 from psfdae.base.options import Folder
@@ -60,7 +60,7 @@ def time_everything(config, cases):
     numpy, so that ratios hold; then as many processes as threads, side by side.
     """
     optics, benchmark = config.optics, config.benchmark
-    peers = [(case, peer) for case in cases for peer in peers_of(case, benchmark)]
+    peers = [(case, peer) for case in cases for peer in list_peers(case, benchmark)]
     rows = []
     for backend in ("numpy", "torch"):
         pairs = [
@@ -74,11 +74,11 @@ def time_everything(config, cases):
                 timed += peers
                 parallel = [(case, replace(setting, threads=1)) for case, setting in timed]
             work = (time_settings, timed, benchmark.repeats, benchmark.stamps)
-            rows += isolated(threads, *work)
+            rows += isolate(threads, *work)
     if benchmark.threads > 1:
-        rows += in_processes(parallel, benchmark.repeats, benchmark.stamps, benchmark.threads)
+        rows += time_in_processes(parallel, benchmark.repeats, benchmark.stamps, benchmark.threads)
     used = {case.aberration: configured_setting(optics, benchmark, case.samples) for case in cases}
-    return finish(rows, used)
+    return mark_pareto_fronts(rows, used)
 
 
 @command("tables")

@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from measure import isolated, pareto, time_in_rounds, use_threads, yes
+from measure import isolate, pareto, time_in_rounds, use_threads, yes
 from psfdae.base.threads import run_parallel
 from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
 from psfdae.optics.pupil import SamplingError
@@ -95,7 +95,7 @@ def kernel_settings(optics, benchmark, samples, backend):
     return list(dict.fromkeys([*settings, used]))
 
 
-def peers_of(case, benchmark, coarse=126):
+def list_peers(case, benchmark, coarse=126):
     """Return settings of other codes: FFTs and, if wanted, POPPY and HCIPy on two grids."""
     fine, single = case.samples, {"precision": "complex64"}
     if not benchmark.peers:
@@ -133,7 +133,7 @@ def time_settings(pairs, repeats, stamps):
         elif setting.method == "poppy_fresnel":  # takes long enough
             batches = 1
         trials.append((case, replace(setting, samples=samples), difference, batches))
-        builders.append(partial(ready, case, setting, batches))
+        builders.append(partial(prepare_batches, case, setting, batches))
     timed, rows = time_in_rounds(builders, repeats), []
     for (case, setting, difference, batches), seconds in zip(trials, timed, strict=True):
         low, median, high = 1e3 * np.percentile(seconds, [25, 50, 75]) / (batches * setting.batch)
@@ -145,12 +145,12 @@ def time_settings(pairs, repeats, stamps):
     return rows
 
 
-def in_processes(pairs, repeats, stamps, processes):
+def time_in_processes(pairs, repeats, stamps, processes):
     """Rows of `time_settings` where so many processes of one thread run side by side.
 
     The time of a stamp is that of one process over their number.
     """
-    results = isolated(1, time_settings, pairs, repeats, stamps, processes=processes)
+    results = isolate(1, time_settings, pairs, repeats, stamps, processes=processes)
     rows = []
     for copies in zip(*results, strict=True):
         times = {key: np.mean([r[key] for r in copies]) / processes for key in TIMES}
@@ -158,7 +158,7 @@ def in_processes(pairs, repeats, stamps, processes):
     return rows
 
 
-def ready(case, setting, batches):
+def prepare_batches(case, setting, batches):
     """A callable that propagates so many batches, set up and warmed up."""
     _, propagate = build(case, setting)
     # The kernel's numpy batches run side by side as in a scene, torch's on its own threads.
@@ -352,7 +352,7 @@ def hcipy_fraunhofer(case, peer):
     return peer.samples, image
 
 
-def finish(rows, used):
+def mark_pareto_fronts(rows, used):
     """The table with its Pareto fronts and the settings in use, by aberration."""
     import pandas as pd
 

@@ -110,7 +110,7 @@ class Case:
         return np.repeat(opd, count, axis=0)
 
 
-def stamps_at(scene, source, offset_px, samples, points, precision="complex128"):
+def simulate_stamps(scene, source, offset_px, samples, points, precision="complex128"):
     """Stamps of sum 1 of all wavefronts at one setting; SamplingError if it is too coarse."""
     pupil = pupil_of(samples, scene.telescope.obscuration)
     size = scene.framing.stamp_px
@@ -128,7 +128,7 @@ def stamp_mse(stamps, truth):
     return ((stamps - truth) ** 2).mean(axis=(1, 2))
 
 
-def relative_to_peak(stamps, reference):
+def compare_to_peak(stamps, reference):
     """Largest difference of normalised stamps in units of each reference's peak."""
     stamps, reference = normalise_flux(stamps)[0], normalise_flux(reference)[0]
     return float((np.abs(stamps - reference).max((-2, -1)) / reference.max((-2, -1))).max())
@@ -155,7 +155,7 @@ def build_cases(scene):
         work = deepcopy(selection)
         propagation = scene.propagation(work, search_px)
         offset = propagation.brightest()
-        stamps = [stamps_at(scene, work, offset, *reference) for reference in REFERENCES]
+        stamps = [simulate_stamps(scene, work, offset, *reference) for reference in REFERENCES]
         geometry = (scene.framing.stamp_px, scene.telescope.pixel, scene.telescope.obscuration)
         samples, truth = int(propagation.samples[0]), stamps[-1][0]
         place = (selection, offset, samples, *geometry, scene.budget, truth)

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from measure import cost_of_command, isolated, write
+from measure import isolate, measure_command, write
 from prediction import make_cube
 from psfdae.base.options import File
 from psfdae.base.rng import stream
@@ -48,11 +48,11 @@ def inference(config: Config, out: Annotated[File, "CSV with stars per second."]
     batches = [batch for batch in BATCHES if batch <= largest_batch]
     dae, rows = config.dae.model_dump(), []
     for threads in sorted({1, settings.threads}):
-        rows += isolated(threads, time_networks, dae, sizes, batches, threads, settings.repeats)
+        rows += isolate(threads, time_networks, dae, sizes, batches, threads, settings.repeats)
     write(out, rows)
 
 
-def random_network(dae, width, side):
+def make_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
@@ -70,7 +70,7 @@ def network(dae, size, threads):
     from psfdae.methods.networks.dae import run_network
 
     torch.set_num_threads(threads)
-    model, factor = random_network(dae, *size)
+    model, factor = make_network(dae, *size)
     return lambda images: run_network(model, images, factor, len(images))
 
 
@@ -106,7 +106,7 @@ def growth(
         ):
             rows = [row for size in sizes for row in chain(config, *size, Path(folder))]
             for _, part in pd.DataFrame(rows).groupby("what", sort=False):
-                frames.append(with_exponents(part, against))
+                frames.append(add_exponents(part, against))
     write(out, pd.concat(frames).assign(threads=config.benchmark.threads))
 
 
@@ -117,16 +117,16 @@ def chain(config, count, side, folder):
     trees = [{**tree, "stars": {**tree["stars"], "count": n}} for n in (FIRST_RUN_STARS, count)]
     names = ("templates.h5", "stars.h5", "model.psf.safetensors", "stars.fits", "psf.fits")
     templates, stars, bundle, cube, psf = (folder / name for name in names)
-    isolated(threads, cost_of_command, ["templates"], templates, tree)
+    isolate(threads, measure_command, ["templates"], templates, tree)
     simulate = ["stars", "--templates", templates]
-    costs = {"simulation": isolated(threads, last_cost, [(simulate, stars, t) for t in trees])}
-    isolated(1, untrained_bundle, tree, stars, bundle)
+    costs = {"simulation": isolate(threads, measure_last, [(simulate, stars, t) for t in trees])}
+    isolate(1, write_untrained_bundle, tree, stars, bundle)
     first_cube = cube.with_name("few.fits")
     for number, path in ((FIRST_RUN_STARS, first_cube), (count, cube)):
-        isolated(1, make_cube, tree, stars, number, path)
+        isolate(1, make_cube, tree, stars, number, path)
     options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
     predict = [(["predict", path, *options], psf) for path in (first_cube, cube)]
-    costs["inference"] = isolated(threads, last_cost, predict)
+    costs["inference"] = isolate(threads, measure_last, predict)
     rows = []
     for stage, cost in costs.items():
         # Where the peak cannot be started anew, that of the imports may be the larger one.
@@ -136,12 +136,12 @@ def chain(config, count, side, folder):
     return rows
 
 
-def last_cost(runs):
+def measure_last(runs):
     """Cost of the last of some commands; imports of the first ones count no longer."""
-    return [cost_of_command(*run) for run in runs][-1]
+    return [measure_command(*run) for run in runs][-1]
 
 
-def untrained_bundle(tree, stars, out):
+def write_untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.base.files import read_product
     from psfdae.denoise.bundle import read_bundle, write_bundle
@@ -153,7 +153,7 @@ def untrained_bundle(tree, stars, out):
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])
-    network, factor = random_network(dae, max(dae["widths"]), side)
+    network, factor = make_network(dae, max(dae["widths"]), side)
     nodes = shipped.errors.noise
     about = {
         **shipped.info.model_dump(exclude={"misfit"}),
@@ -174,7 +174,7 @@ def untrained_bundle(tree, stars, out):
     write_bundle(bundle, out)
 
 
-def with_exponents(part, against):
+def add_exponents(part, against):
     """Measured rows with the exponents of their costs and, over stars, a predicted row."""
     import pandas as pd
     from scipy.stats import linregress
@@ -186,7 +186,7 @@ def with_exponents(part, against):
         row = part.iloc[-1].to_dict() | {"stars": PREDICTED_STARS, "measured": "extrapolated"}
         # Not the memory: both stages work on a piece of the stars at a time.
         names = [name for name in COSTS if name != "peak_mb"]
-        row |= {"peak_mb": np.nan} | extrapolated(part.to_dict("records"), names, PREDICTED_STARS)
+        row |= {"peak_mb": np.nan} | extrapolate(part.to_dict("records"), names, PREDICTED_STARS)
         table = pd.concat([table, pd.DataFrame([row])])
     table.insert(1, "against", against)
     # Two points leave the error of the exponent open.
@@ -196,7 +196,7 @@ def with_exponents(part, against):
     return table.assign(**exponents)
 
 
-def extrapolated(rows, names, stars):
+def extrapolate(rows, names, stars):
     """Costs of more stars than measured: a fixed part and a part per star, neither negative.
 
     Least squares of relative deviations, so that small and large sizes count alike.
@@ -217,12 +217,12 @@ READS = ("parts", *list_method_groups(), "evaluation", "methods", "benchmark")
 @command("stages", reads=(*SIMULATION, "noise", *READS))
 def stages(config: Config, out: Annotated[File, "CSV with measured and planned costs."]) -> None:
     """Measure the stages that grow with the number of stars, on one CPU."""
-    with TemporaryDirectory() as folder, one_cpu():
-        rows = measured(config, Path(folder))
-    write(out, rows + planned(rows))
+    with TemporaryDirectory() as folder, stay_on_one_cpu():
+        rows = measure_stages(config, Path(folder))
+    write(out, rows + predict_plans(rows))
 
 
-def measured(config, folder):
+def measure_stages(config, folder):
     """Costs of every stage at the numbers benchmark.star_counts, four fifths for training."""
     threads, tree, rows = config.optics.threads, config.model_dump(), []
     # Whole stamps: epochs that see their middle cost less.
@@ -231,10 +231,10 @@ def measured(config, folder):
     templates, simulated, stars, cube = (folder / name for name in names)
     places = {kind: folder / kind.name for kind in map(method, config.methods) if kind.storage}
     bundle = folder / "model.psf.safetensors"
-    isolated(threads, cost_of_command, ["templates"], templates, tree)
+    isolate(threads, measure_command, ["templates"], templates, tree)
 
     def cost(stage, words, out, reads=tree):
-        costs = isolated(threads if stage == "simulate" else 1, cost_of_command, words, out, reads)
+        costs = isolate(threads if stage == "simulate" else 1, measure_command, words, out, reads)
         row = {"stage": stage, "stars": count, "epochs": TRAINED_EPOCHS * (stage == "train")}
         row |= {name: costs[name] for name in ("time_s", "cpu_s")}
         row |= {f"{name}_mb": costs[f"{name}_b"] / 1e6 for name in ("peak", "disk")}
@@ -246,7 +246,7 @@ def measured(config, folder):
     stars_option = ["--stars", stars]
     for i, count in enumerate(config.benchmark.star_counts):
         tree["parts"] |= {"train_stars": 4 * count // 5, "test_stars": count - 4 * count // 5}
-        isolated(1, repeat_stars, simulated, count, stars)
+        isolate(1, repeat_stars, simulated, count, stars)
         models = ["--dataset", "measured"]
         for kind, place in places.items():
             checkpoint_option = ["--checkpoint", folder / "fit.pt"]
@@ -255,8 +255,8 @@ def measured(config, folder):
         models += ["--per-star", folder / "per_star.parquet", "--restored", folder / "shown.h5"]
         cost("evaluate", ["evaluate", *stars_option, *models], folder / "summary.csv")
         if i < SIMULATED:
-            isolated(1, untrained_bundle, tree, stars, bundle)
-            isolated(1, make_cube, tree, stars, count, cube)
+            isolate(1, write_untrained_bundle, tree, stars, bundle)
+            isolate(1, make_cube, tree, stars, count, cube)
             options = ["--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
             cost("predict", ["predict", cube, *options], folder / "psf.fits", None)
     return rows
@@ -278,7 +278,7 @@ def repeat_stars(stars, count, out):
 
 
 @contextmanager
-def one_cpu():
+def stay_on_one_cpu():
     """Keep this process and those it starts on one CPU, as a job of the SLURM profile is."""
     if not hasattr(os, "sched_setaffinity"):
         yield
@@ -291,14 +291,14 @@ def one_cpu():
         os.sched_setaffinity(0, cpus)
 
 
-def planned(rows):
+def predict_plans(rows):
     """A row of `PLANNED_STARS` per stage."""
     stages = {}
     for row in rows:
         stages.setdefault(row["stage"], []).append(row)
     return [
         {**part[0], "stars": PLANNED_STARS, "measured": "extrapolated"}
-        | extrapolated(part, ("cpu_s", *COSTS), PLANNED_STARS)
+        | extrapolate(part, ("cpu_s", *COSTS), PLANNED_STARS)
         for part in stages.values()
     ]
 

@@ -41,10 +41,10 @@ def seeds(
     test = star_sets.split_stars(product, "random", config).test
     position = star_sets.field_positions(product)[test]
     noisy = {x: star_sets.noisy_test_images(config, product, test, x) for x in config.noise.levels}
-    base = own_fits(config, kind, dataset, reference, product, results)
+    base = load_own_fits(config, kind, dataset, reference, product, results)
     rows = []
     for seed in range(config.seed, config.seed + SEEDS):
-        fits = base if seed == config.seed else other_fits(config, kind, base, product, seed)
+        fits = base if seed == config.seed else fit_other_seed(config, kind, base, product, seed)
         for target, fitted in fits.items():
             row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
             for level, images in noisy.items():
@@ -54,13 +54,13 @@ def seeds(
     write(out, rows)
 
 
-def own_fits(config, kind, dataset, references, product, results):
+def load_own_fits(config, kind, dataset, references, product, results):
     """The fits of the workflow by reference; where they leave no file, the same again."""
     by_reference = {}
     for reference in references:
         if kind.storage:
             place = results / fits.get_fit_path(kind, dataset, "random", reference)
-            fits.require(kind, place, product, config, "random", reference)
+            fits.require_fit(kind, place, product, config, "random", reference)
             by_reference[reference] = kind.load(place, reference, config.evaluation)
         else:
             data = star_sets.training_set(config, kind, product, "random", reference)
@@ -68,7 +68,7 @@ def own_fits(config, kind, dataset, references, product, results):
     return by_reference
 
 
-def other_fits(config, kind, references, product, seed):
+def fit_other_seed(config, kind, references, product, seed):
     """Fits that differ from the given ones by nothing but their seed."""
     by_reference = {}
     goes_on = kind.continues(config)
@@ -95,10 +95,10 @@ def scatter(
     """Pool ERRORS, tables of the command seeds, over the noise levels."""
     import pandas as pd
 
-    write_csv(out, pooled(pd.concat(map(read_table, errors))), 3)
+    write_csv(out, pool_seeds(pd.concat(map(read_table, errors))), 3)
 
 
-def pooled(errors):
+def pool_seeds(errors):
     """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
     from psfdae_paper.evaluation.comparison import FIT_KEYS
 

@@ -105,8 +105,6 @@ use rule figure_benchmark as posterior_network with:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/figure_posterior_network.tsv"
     params:
-        source=hash_code("workflow/benchmarks/figures.py"),
-        program=locate_program("figures.draw"),
         kind="costs",
         scene=[],
     message:
@@ -146,8 +144,8 @@ rule seeds_of_method:
         config=lambda w: settings(
             RUN, "trainings.seeds", f"dataset={w.dataset}", name=w.method
         ),
-        source=lambda w: program_code(
-            "trainings.seeds", timings.get_timing_module(w.method)
+        source=lambda w: source_hash(
+            "workflow/benchmarks/trainings.py", timings.get_timing_module(w.method)
         ),
         program=locate_program("trainings.seeds"),
         method=lambda w: w.method,
@@ -179,7 +177,7 @@ rule seed_scatter:
         f"{RESULTS}/benchmarks_on_request/seeds/scatter.tsv"
     localrule: True
     params:
-        source=hash_program("trainings.scatter"),
+        source=hash_code("workflow/benchmarks/trainings.py"),
         program=locate_program("trainings.scatter"),
     message:
         "Pooling the scatter between seeds"

@@ -2,7 +2,7 @@
 rule bundle:
     input:
         stars=lambda w: datasets.stars_file(RUN, w.dataset),
-        model=lambda w: fits.list_bundle_inputs(RUN, w),
+        model=lambda w: fits.fit_outputs(RUN, *fits.identify_fit(w)),
     output:
         f"{RESULTS}/bundles/{{dataset}}-{{split}}-{{reference}}{{suffix}}.psf.safetensors",
     log:
@@ -17,7 +17,7 @@ rule bundle:
     params:
         config=lambda w: settings(RUN, "bundle", f"dataset={w.dataset}"),
         source=lambda w: fits.methods_code("bundle", [fits.bundle_suffixes()[w.suffix]]),
-        model=lambda w: fits.get_bundle_option(RUN, w),
+        model=lambda w: fits.fit_option(RUN, *fits.identify_fit(w)),
         # A model that comes with a package is small.
         size=lambda w: ["--largest-mb=4.8"] * (w.dataset == datasets.SHIPPED_DATASET),
     message:

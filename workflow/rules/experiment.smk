@@ -66,10 +66,6 @@ use rule track as track_experiment with:
     localrule: True
     params:
         what=lambda w: [f"--experiment {w.experiment}", *experiments.variant_stars(RUN)],
-        results=lambda w: RESULTS,
-        preset=PRESET,
-        database=f"{RESULTS}/mlflow.db",
-        source=hash_code("track"),
     message:
         "Importing experiment {wildcards.experiment} into MLflow"
 

@@ -132,10 +132,6 @@ use rule track as track_sweep with:
     localrule: True
     params:
         what="--sweep {sweep}",
-        results=lambda w: RESULTS,
-        preset=PRESET,
-        database=f"{RESULTS}/mlflow.db",
-        source=hash_code("track"),
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
 

@@ -26,7 +26,9 @@ rule cost:
             extra=timings.get_point_overrides(w),
             name=w.method,
         ),
-        source=lambda w: program_code("costs.cost", timings.get_timing_module(w.method)),
+        source=lambda w: source_hash(
+            "workflow/benchmarks/costs.py", timings.get_timing_module(w.method)
+        ),
         program=locate_program("costs.cost"),
         inputs=as_options,
     message:
@@ -48,7 +50,7 @@ rule benchmark_costs:
         f"{RESULTS}/benchmarks_on_request/benchmark/benchmark_costs.tsv"
     localrule: True
     params:
-        source=hash_program("costs.costs"),
+        source=hash_code("workflow/benchmarks/costs.py"),
         program=locate_program("costs.costs"),
         points=lambda w: repr(timings.load_timing_points()),
     message:
@@ -89,7 +91,7 @@ rule benchmark_inference:
         config=lambda w: settings(
             RUN, "speed.inference", timings.choose_timing_dataset()
         ),
-        source=hash_program("speed.inference"),
+        source=hash_code("workflow/benchmarks/speed.py"),
         program=locate_program("speed.inference"),
     message:
         "Measuring for the table benchmark_inference"
@@ -112,7 +114,9 @@ rule benchmark_scaling:
         disk_mb=2000,
     params:
         config=lambda w: settings(RUN, "speed.growth", timings.choose_timing_dataset()),
-        source=hash_program("speed.growth", "templates", "stars", "predict"),
+        source=hash_code(
+            "workflow/benchmarks/speed.py", "templates", "stars", "predict"
+        ),
         program=locate_program("speed.growth"),
     message:
         "Measuring for the table benchmark_scaling"
@@ -141,7 +145,7 @@ rule predict_throughput:
         config=lambda w: settings(
             RUN, "prediction.throughput", timings.choose_timing_dataset()
         ),
-        source=hash_program("prediction.throughput", "predict"),
+        source=hash_code("workflow/benchmarks/prediction.py", "predict"),
         program=locate_program("prediction.throughput"),
         inputs=as_options,
     message:
@@ -168,7 +172,7 @@ rule predict_poppy:
         config=lambda w: settings(
             RUN, "prediction.poppy", timings.choose_timing_dataset()
         ),
-        source=hash_program("prediction.poppy"),
+        source=hash_code("workflow/benchmarks/prediction.py"),
         program=locate_program("prediction.poppy"),
         inputs=as_options,
         limit=lambda w: [f"--count={timings.poppy_stars(RUN)}"],
@@ -203,7 +207,7 @@ rule predict_coverage:
         config=lambda w: settings(
             RUN, "prediction.coverage", timings.choose_timing_dataset()
         ),
-        source=hash_program("prediction.coverage"),
+        source=hash_code("workflow/benchmarks/prediction.py"),
         program=locate_program("prediction.coverage"),
         inputs=as_options,
     message:
@@ -231,7 +235,7 @@ rule predict_strange:
         config=lambda w: settings(
             RUN, "prediction.outliers", timings.choose_timing_dataset()
         ),
-        source=hash_program("prediction.strange"),
+        source=hash_code("workflow/benchmarks/prediction.py"),
         program=locate_program("prediction.strange"),
         inputs=as_options,
     message:
@@ -255,8 +259,13 @@ rule scaling_stages:
         disk_mb=2000,
     params:
         config=lambda w: settings(RUN, "speed.stages", timings.choose_timing_dataset()),
-        source=hash_program(
-            "speed.stages", "templates", "stars", "fit", "evaluate", "predict"
+        source=hash_code(
+            "workflow/benchmarks/speed.py",
+            "templates",
+            "stars",
+            "fit",
+            "evaluate",
+            "predict",
         ),
         program=locate_program("speed.stages"),
     message:

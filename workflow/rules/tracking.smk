@@ -43,9 +43,5 @@ use rule track as track_alignment with:
     localrule: True
     params:
         what="--alignment",
-        results=lambda w: RESULTS,
-        preset=PRESET,
-        database=f"{RESULTS}/mlflow.db",
-        source=hash_code("track"),
     message:
         "Importing the runs of scene 3 into MLflow"

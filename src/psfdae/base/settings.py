@@ -59,7 +59,7 @@ class ConfigError(Error, ValueError):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def parse_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
+def parse_settings(model: type[Model], tree: Mapping[str, Any], source: object = "") -> Model:
     """Check a configuration tree against a pydantic model.
 
     Parameters
@@ -68,6 +68,8 @@ def parse_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
         Class that declares the keys, their types and their ranges.
     tree : mapping
         Values by key; groups are mappings.
+    source : Path or str
+        File of the tree, with which each line of the message begins.
 
     Returns
     -------
@@ -83,8 +85,9 @@ def parse_settings(model: type[Model], tree: Mapping[str, Any]) -> Model:
         return model.model_validate(tree)
     except ValidationError as error:
         # All keys of the model, for suggestions in place of an unknown one.
-        keys = list(list_keys(model))
-        raise ConfigError("\n".join(_line(e, keys) for e in error.errors())) from None
+        keys, prefix = list(list_keys(model)), f"{source}: " if source else ""
+        lines = (prefix + _line(e, keys) for e in error.errors())
+        raise ConfigError("\n".join(lines)) from None
 
 
 def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -122,11 +125,12 @@ def dump_deciding(group: Group) -> dict[str, Any]:
     # Neutral settings are removed, group by group.
     tree = group.model_dump()
     for name, field in type(group).model_fields.items():
-        # Groups inside the group may have neutral settings as well.
+        # Groups inside the group may have neutral settings as well; a group that is left out of the
+        # tree, because it has its defaults, stays out.
         value = getattr(group, name)
         if NEUTRAL in field.metadata:
             del tree[name]
-        elif isinstance(value, Group):
+        elif isinstance(value, Group) and name in tree:
             tree[name] = dump_deciding(value)
     return tree
 

@@ -23,16 +23,7 @@ from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
 from textwrap import shorten
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import click
 

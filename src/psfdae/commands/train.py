@@ -33,7 +33,6 @@ from psfdae.methods import fit_files as fits
 from psfdae.methods import method
 from psfdae.methods.interface import Method
 from psfdae.report.validation import validate
-from psfdae.telescope.settings import read_telescope
 from psfdae.training.exposures import adapt_to_exposures
 from psfdae.training.fitting import (
     choose_method,
@@ -52,7 +51,6 @@ from psfdae.training.settings import (
     make_settings,
 )
 from psfdae.training.stars import ImageStars
-from psfdae.training.telescope_stars import simulate_stars
 
 
 class FolderError(Error, RuntimeError):
@@ -234,6 +232,10 @@ def train_on_telescope(
     ConfigError
         If the method learns positions in an image, or the file does not describe a telescope.
     """
+    # Optics, which images do not need.
+    from psfdae.telescope.settings import read_telescope
+    from psfdae.training.telescope_stars import simulate_stars
+
     if method_name is not None and method(method_name).knows_field:
         raise ConfigError(f"--method {method_name}: learns positions in an image; not --telescope")
     telescope = read_telescope(telescope_path)

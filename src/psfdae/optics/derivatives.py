@@ -9,10 +9,12 @@ polynomials. The field of such a product is two matrix products with weighted ma
 along x are shared by all b, so that all directions together take the time of a few stamps. Where
 directions are few and modes many, a field for each direction takes less time.
 
-There are three ways from the pupil to the pixels, each of them a `propagation.Sampling`:
+There are four ways from the pupil to the pixels, each of them a `propagation.Sampling`:
 
 - `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
   narrower than the image's period;
+- `ImageSampling`: the same points; derivatives from the field in the image, with an error of 2e-4
+  in half of the time or less;
 - `PeriodSampling`: the whole period of the image by a Fourier transform. The
   intensity is a trigonometric polynomial, which its samples determine, so pixels
   are integrated exactly. It is faster for stamps nearly as wide as the period;
@@ -21,7 +23,7 @@ There are three ways from the pupil to the pixels, each of them a `propagation.S
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -126,6 +128,55 @@ class PointSampling(SeparableSampling):
         """Propagate along y as `Sampling` does."""
         # Transposed, so that both directions use the same products.
         return self.along_x(rows.swapaxes(-1, -2), degrees).swapaxes(-1, -2)
+
+
+class ImageSampling(PointSampling):
+    """Points of `PointSampling`, from whose fields the derivatives follow, with its parameters.
+
+    A polynomial times the pupil field gives a derivative of the image's field, a linear combination
+    of its values: with waves V = exp(−πi x u) of pupil samples x and points u, P_a V ≈ V Q_aᵀ. The
+    matrices Q_a of least squares are real for even a, and imaginary for odd a.
+    """
+
+    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+        super().__init__(pupil, stamp_px, pixel, precision)
+        self._pupil_axis = pupil.axis
+        half, _, _ = image_points(pupil, stamp_px, pixel)
+        self._all_waves = np.exp(-1j * np.pi * np.outer(pupil.axis, [*-half[::-1], *half]))
+        self._matrices: dict[int, np.ndarray] = {}
+
+    def _combine(self, degree: int) -> np.ndarray:
+        """Return Q_a, or Q_a / i for an odd degree a; it is kept."""
+        if degree not in self._matrices:
+            # Small singular values are left out: they would amplify rounding.
+            weighted_waves = legendre([degree], self._pupil_axis)[0][:, None] * self._all_waves
+            matrix = np.linalg.lstsq(self._all_waves, weighted_waves, rcond=1e-5)[0].T
+            part = matrix.imag if degree % 2 else matrix.real
+            self._matrices[degree] = part.astype(self.dtype)
+        return self._matrices[degree]
+
+    def differentiate(
+        self, pupil_fields: np.ndarray, degrees: Mapping[int, Sequence[int]]
+    ) -> tuple[np.ndarray, dict[tuple[int, int], np.ndarray]]:
+        """Return intensities at the points, and pixels of Im E Re G − Re E Im G of products.
+
+        G is the field of P_a(x) P_b(y); `degrees` has all b of each a.
+        """
+        (rows,) = self.along_x(pupil_fields)
+        (field,) = self.along_y(rows)
+        image, slopes = np.stack([field.real, field.imag]), {}
+        for a, y_degrees in degrees.items():
+            along_x = image @ self._combine(a).T
+            for b in y_degrees:
+                real, imaginary = self._combine(b) @ along_x
+                # Each odd degree has a factor i.
+                if (a + b) % 2:
+                    slope = image[1] * -imaginary - image[0] * real
+                else:
+                    sign = -1.0 if a % 2 else 1.0
+                    slope = sign * (image[1] * real - image[0] * imaginary)
+                slopes[a, b] = self.to_pixels(slope)
+        return image[0] ** 2 + image[1] ** 2, slopes
 
 
 class PeriodSampling(SeparableSampling, WholePeriod):
@@ -279,23 +330,27 @@ class ModalStamps:
         """Return intensities and slopes as above, by a field per product of polynomials."""
         sampling = self._sampling
         slopes: dict[tuple[int, int], np.ndarray] = {}
-        rows_of_degrees = sampling.along_x(pupil_fields, [*self._degrees])
-        for (a, y_degrees), rows in zip(self._degrees.items(), rows_of_degrees, strict=True):
-            # P_a(x) along x is shared by all P_b(y) of its products; P_0 P_0 is the field itself.
-            changes = sampling.along_y(rows, y_degrees)
-            if a == 0:
-                image = changes[0]
-            for b, change in zip(y_degrees, changes, strict=True):
-                # Im E Re G − Re E Im G, as by direction; stored as pixels, which are fewer.
-                slope = image.imag * change.real - image.real * change.imag
-                slopes[a, b] = sampling.to_pixels(slope)
+        if isinstance(sampling, ImageSampling):
+            intensity, slopes = sampling.differentiate(pupil_fields, self._degrees)
+        else:
+            rows_of_degrees = sampling.along_x(pupil_fields, [*self._degrees])
+            for (a, y_degrees), rows in zip(self._degrees.items(), rows_of_degrees, strict=True):
+                # P_a(x) along x is shared by all P_b(y); P_0 P_0 is the field itself.
+                changes = sampling.along_y(rows, y_degrees)
+                if a == 0:
+                    image = changes[0]
+                for b, change in zip(y_degrees, changes, strict=True):
+                    # Im E Re G − Re E Im G, as by direction; stored as pixels, which are fewer.
+                    slope = image.imag * change.real - image.real * change.imag
+                    slopes[a, b] = sampling.to_pixels(slope)
+            intensity = image.real**2 + image.imag**2
         # Slopes along a direction are sums of the products' slopes times their coefficients in it.
         weights = directions @ self._coefficients
         by_product = [slopes[degrees] for degrees in self._products]
         product_slopes = (4.0 * np.pi) * np.stack(by_product, axis=1)
         flat = weights @ product_slopes.reshape(*product_slopes.shape[:2], -1)
         shape = (len(product_slopes), weights.shape[1], *product_slopes.shape[2:])
-        return image.real**2 + image.imag**2, flat.reshape(shape)
+        return intensity, flat.reshape(shape)
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """Return OPD maps in waves, shape (B, M, M)."""

@@ -121,22 +121,19 @@ def shift_stamps(
     # The influence of the edge on the splines decreases by a factor of 3.7 per pixel, to 1e-7 after
     # a margin of 12 px.
     side, margin = stamps.shape[-1], 12
-    # One set of splines per stamp, however often the stamp is shifted.
     stamp = np.arange(len(stamps)) if stamp is None else stamp
-    sources, stamp = np.unique(stamp, return_inverse=True)
-    # Coefficients of the splines through the pixels of each stamp.
-    splines = np.pad(stamps[sources], ((0, 0), (margin, margin), (margin, margin)), mode="edge")
-    for axis in (1, 2):
-        splines = ndimage.spline_filter1d(splines, 3, axis, mode="nearest")
-    # The pixels of a shifted stamp lie at −shift among the knots. With coefficients c and matrices
-    # R, C of the splines at the rows and columns of these pixels, their values are R c Cᵀ. 256
-    # stamps at a time limit the memory.
+    # Coefficients of the splines through the pixels of an axis are linear in these. The pixels of a
+    # shifted stamp lie at −shift among the knots: with matrices R, C of the splines at its rows and
+    # columns, times the coefficients of each pixel, its values are R x Cᵀ. 256 stamps at a time
+    # limit the memory.
+    pixels = np.pad(np.eye(side), ((margin, margin), (0, 0)), mode="edge")
+    splines = ndimage.spline_filter1d(pixels, 3, 0, mode="nearest")
     shifted_stamps, knots = np.empty((len(stamp), side, side)), side + 2 * margin
-    pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
+    axis, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
     for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
-        position = np.clip(pixels - shift[part, :, None], -farthest, farthest)
-        rows, columns = cubic_splines(position, knots, 1.0).swapaxes(0, 1)
-        shifted_stamps[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
+        position = np.clip(axis - shift[part, :, None], -farthest, farthest)
+        rows, columns = (cubic_splines(position, knots, 1.0) @ splines).swapaxes(0, 1)
+        shifted_stamps[part] = rows @ stamps[stamp[part]] @ columns.transpose(0, 2, 1)
     return shifted_stamps
 
 
@@ -188,12 +185,15 @@ def cubic_splines(
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:
-    """Return matrices (n, s, s) that shift the pixels of an axis by n steps in px; 0 outside."""
+    """Return matrices (…, s, s) that shift the pixels of an axis by steps (…) in px; 0 outside."""
     from scipy import ndimage
 
-    # A shifted image of a single pixel is a column of the matrix.
-    impulses = np.eye(side)
-    return np.array([ndimage.shift(impulses, (step, 0.0), order=3) for step in steps])
+    # Cubic splines through the pixels, reflected at the edges, at the pixels before the shift.
+    splines = ndimage.spline_filter1d(np.eye(side), 3, 0, mode="mirror")
+    position = np.arange(side) - steps[..., None]
+    weights = cubic_splines(position - (side - 1) / 2, side + 4, 1.0)
+    weights[(position < 0) | (position > side - 1)] = 0.0
+    return np.asarray(weights @ np.pad(splines, ((2, 2), (0, 0)), mode="reflect"))
 
 
 def find_centroids(

@@ -68,11 +68,7 @@ class ZernikeTracer:
     """
 
     def __init__(
-        self,
-        optic: CompoundOptic,
-        wavelength_m: float,
-        field_rad: np.ndarray,
-        highest_noll: int,
+        self, optic: CompoundOptic, wavelength_m: float, field_rad: np.ndarray, highest_noll: int
     ) -> None:
         import batoid
 

@@ -165,13 +165,7 @@ def read_telescope(path: str | Path) -> OwnTelescope:
     'refractor: a pixel is 1.76 λ/D wide'
     """
     # Errors in included files name these files.
-    tree = compose_tree(Path(path))
-    try:
-        return parse_settings(OwnTelescope, tree)
-    except ConfigError as error:
-        # Every line of the message names the file.
-        lines = str(error).splitlines()
-        raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
+    return parse_settings(OwnTelescope, compose_tree(Path(path)), path)
 
 
 def compose_tree(path: Path, including: tuple[Path, ...] = ()) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 A word of a command line is `group.key=value`. A word that chooses a file of a configuration, such
 as `dataset=field` or `preset=smoke`, is read by the extra "paper", by its entry point of the group
-"psfdae.base.settings".
+"psfdae.settings".
 """
 
 from __future__ import annotations

@@ -1,13 +1,16 @@
 """Modes of stars' posteriors: their positions, widths and masses, and draws around them.
 
 The input is the starting points of a search, or the modes that it has found; the output is distinct
-modes of noticeable mass, and draws from Student's t distributions around them.
+modes of noticeable mass, and draws from Student's t distributions around them. These adapt to the
+weights of their draws (Cappé et al. 2008, Statistics and Computing 18, 447): every mode takes the
+weighted mean, scale and mass of its draws.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from math import lgamma
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +18,6 @@ import numpy as np
 from psfdae.base.rows import Rows
 from psfdae.sensing.climbing import group_maximum
 from psfdae.sensing.modes import merge_modes
-from psfdae_paper.bounds.mixture import Mixture
 
 
 class Knowledge(IntEnum):
@@ -57,6 +59,9 @@ class Modes(Rows):
         Modes whose evidence is lower than a star's maximum by more than this are left out. The
         evidence assumes a Gaussian, a poor approximation along a bent ridge of the posterior: a
         smaller limit would leave out modes that have much mass.
+    freedom : float
+        Degrees of freedom ν of Student's t, whose tails are heavier than the tails of any normal
+        posterior.
     """
 
     star: np.ndarray
@@ -67,6 +72,7 @@ class Modes(Rows):
     factor: np.ndarray
     evidence: np.ndarray
     max_drop: ClassVar[float] = 50.0
+    freedom: ClassVar[float] = 5.0
 
     @classmethod
     def make_starts(
@@ -87,30 +93,61 @@ class Modes(Rows):
         """Group number of each mode by star and knowledge, (M,)."""
         return np.asarray(len(Knowledge) * self.star + self.knowledge)
 
-    @property
-    def mixture(self) -> Mixture:
-        """Student's t around the modes."""
-        return Mixture(self.z, self.factor, self.evidence)
+    def compute_squared_distance(self, z: np.ndarray) -> np.ndarray:
+        """Return (x − μ)ᵀ (LLᵀ)⁻¹ (x − μ) of draws x (n, 5) from every mode, shape (M, n)."""
+        # With L u = x − μ the squared distance is |u|².
+        offset = np.linalg.solve(self.factor, (z - self.z[:, None]).swapaxes(1, 2))
+        return np.asarray((offset**2).sum(axis=1))
 
-    def log_density(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Return the log-density of Student's t around every mode at draws (n, 5), (M, n)."""
-        mixture = self.mixture
-        density = mixture.log_density(mixture.compute_squared_distance(z))
-        return np.asarray(density + self._log_support(field, offset))
+    def log_density(self, draws: Positions, squared_distance: np.ndarray) -> np.ndarray:
+        """Return the log-density of Student's t around every mode at draws, (M, n).
 
-    def _log_support(self, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Return 0 for draws in a mode's own field and offset, otherwise −∞, shape (M, n)."""
+        With ν degrees of freedom in D dimensions, ln p = ln Γ((ν + D)/2) − ln Γ(ν/2)
+        − (D/2) ln(νπ) − ln |L| − (ν + D)/2 ln(1 + distance²/ν).
+        """
+        terms = self.z.shape[1]
+        # ln |L| of a triangular matrix is the sum over its diagonal.
+        log_determinant = np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(axis=1)
+        constant = lgamma(0.5 * (self.freedom + terms)) - lgamma(0.5 * self.freedom)
+        constant -= 0.5 * terms * np.log(self.freedom * np.pi)
+        tail = 0.5 * (self.freedom + terms) * np.log1p(squared_distance / self.freedom)
         # Fields and offsets are discrete: a mode proposes draws at its own field and offset only.
-        is_own = self.field[:, None] == field
-        is_own &= (self.offset[:, None] == offset).all(axis=2)
-        return np.where(is_own, 0.0, -np.inf)
+        is_own = self.field[:, None] == draws.field
+        is_own &= (self.offset[:, None] == draws.offset).all(axis=2)
+        return np.where(is_own, constant - log_determinant[:, None] - tail, -np.inf)
 
     def adapt(self, draws: Positions, log_weight: np.ndarray) -> Modes:
-        """Adapt positions, scales and masses to the weights (n,) of all draws of the star."""
-        # A mode adapts to the draws in its own field and at its own offset.
-        log_support = self._log_support(draws.field, draws.offset)
-        mixture = self.mixture.adapt(draws.z, log_weight, log_support)
-        return replace(self, z=mixture.mean, factor=mixture.factor, evidence=mixture.evidence)
+        """Adapt positions, scales and masses to the weights (n,) of all draws of the star.
+
+        One step of expectation maximisation for Student's t. The modes are returned unchanged if
+        all draws are impossible.
+        """
+        if not np.isfinite(log_weight).any():
+            return self
+        smallest = np.finfo(float).tiny
+        squared_distance, terms = self.compute_squared_distance(draws.z), self.z.shape[1]
+        # Responsibility of each mode for each draw, times the weight of the draw.
+        log_part = self.log_density(draws, squared_distance) + self.evidence[:, None]
+        weight = np.exp(log_weight - log_weight.max())
+        with np.errstate(invalid="ignore"):
+            share = np.exp(log_part - np.logaddexp.reduce(log_part, axis=0))
+        share = np.where(np.isfinite(share), share, 0.0) * weight
+        mass = share.sum(axis=1)
+        # Shrinkage towards the previous mode: 10 effective draws, (Σw)²/Σw², move it half way to
+        # the estimate from the draws.
+        effective = mass**2 / np.maximum((share**2).sum(axis=1), smallest)
+        gain = (effective / (effective + 10.0))[:, None]
+        # Distant draws weigh (ν + D)/(ν + distance²), as in the maximum-likelihood fit of t.
+        share *= (self.freedom + terms) / (self.freedom + squared_distance)
+        share /= np.maximum(share.sum(axis=1, keepdims=True), smallest)
+        # Weighted mean and scale matrix of the draws, as far as they are trusted.
+        mean = self.z + gain * (share @ draws.z - self.z * share.sum(axis=1, keepdims=True))
+        offset = draws.z - mean[:, None]
+        scale = (share[:, :, None] * offset).swapaxes(1, 2) @ offset
+        gain = gain[..., None]
+        scale = gain * scale + (1.0 - gain) * (self.factor @ self.factor.swapaxes(1, 2))
+        evidence = np.log(np.maximum(mass, smallest))
+        return replace(self, z=mean, factor=np.linalg.cholesky(scale), evidence=evidence)
 
     def draw(
         self, count: int, star_field: int, rng: np.random.Generator
@@ -148,7 +185,11 @@ class Modes(Rows):
         number = np.ceil(share * count).astype(int)
         # Number of the mode of each draw; modes follow one another.
         mode = np.repeat(np.arange(share.size), number)
-        return Positions(self.field[mode], self.offset[mode], self.mixture.draw(mode, rng)), number
+        # Student's t is a normal variable times √(ν/χ²).
+        normal = rng.standard_normal((mode.size, self.z.shape[1]))
+        stretch = np.sqrt(self.freedom / rng.chisquare(self.freedom, mode.size))
+        z = self.z[mode] + (self.factor[mode] @ (normal * stretch[:, None])[:, :, None])[:, :, 0]
+        return Positions(self.field[mode], self.offset[mode], z), number
 
 
 def rank_in_group(group: np.ndarray, key: np.ndarray) -> np.ndarray:

@@ -30,11 +30,17 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from psfdae.base.rows import Rows
-from psfdae.optics.derivatives import PointSampling, SampledStamps, normalise_with_derivatives
+from psfdae.optics.derivatives import ImageSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.pupil import annular_pupil, choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
-from psfdae.sensing.climbing import group_maximum, poisson_information
+from psfdae.sensing.climbing import (
+    Evaluation,
+    compute_deviance_limit,
+    group_maximum,
+    poisson_information,
+)
 from psfdae.stars.noise import NoiseModel
+from psfdae_paper.bounds.modes import rank_in_group
 from psfdae_paper.bounds.posterior_network import (
     PosteriorNetwork,
     WavefrontCoordinates,
@@ -88,32 +94,58 @@ class SeidelPrior:
         fields : ndarray of int, shape (n, f)
             Fields of each star.
         """
-        count, size = fields.shape
-        directions = self.directions[fields]
-        terms = directions.shape[2]
-        # A = D M Dᵀ + 1 of all fields, as products with one M for each star.
-        weighted_directions = (directions.reshape(count, -1, len(MONOMIALS)) @ information).reshape(
+        directions, tilts = self.directions[fields], slice(-2, None)
+        # A = D M Dᵀ + 1, with D M of all fields as one product for each star.
+        flat_shape = len(point), -1, len(MONOMIALS)
+        weighted_directions = (directions.reshape(flat_shape) @ information).reshape(
             directions.shape
         )
-        curvature = weighted_directions @ directions.swapaxes(2, 3) + np.eye(terms)
-        covariance, log_determinant = invert(curvature)
-        # e = s − c⁰. A pixel's width is a tilt by half of it in λ/D: tilts that whole pixels leave,
-        # of the two offsets on either side along each axis.
-        gap = np.repeat((self.static[fields] - point[:, None])[:, :, None], 4, axis=2)
-        step = 0.5 * self.pixel
-        remainder = np.mod(gap[..., -2:], step)
-        gap[..., -2:] = remainder - step * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-        # ⟨z⟩ = A⁻¹ D (g − M e), and the logarithm of the mass.
-        curved_gap = (gap.reshape(count, -1, len(MONOMIALS)) @ information).reshape(gap.shape)
-        slope = score[:, None, None] - curved_gap
-        right_side = slope @ directions.swapaxes(2, 3)
+        curvature = weighted_directions @ directions.swapaxes(2, 3)
+        covariance, log_determinant = invert(curvature + np.eye(directions.shape[2]))
+        # e = s − c⁰. A pixel's width is a tilt by half of it in λ/D: tilts that whole pixels leave.
+        gap, step = self.static[fields] - point[:, None], 0.5 * self.pixel
+        gap[..., tilts] = np.mod(gap[..., tilts], step)
+        slope = score[:, None] - gap @ information
+        # The two offsets on either side along each axis are tilts t, e − t. Then b = D (g − M e)
+        # + D M t, and gᵀe − ½ eᵀMe grows by −tᵀ(g − M e) − ½ tᵀMt.
+        tilt = step * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        right_side = (directions @ slope[..., None]).swapaxes(2, 3)
+        right_side = right_side + tilt @ weighted_directions[..., tilts].swapaxes(2, 3)
         z = right_side @ covariance
+        log_mass = 0.5 * ((gap * (score[:, None] + slope)).sum(axis=2) - log_determinant)[..., None]
+        log_mass = log_mass - slope[..., tilts] @ tilt.T + 0.5 * (right_side * z).sum(axis=3)
+        log_mass -= 0.5 * ((tilt @ information[:, tilts, tilts]) * tilt).sum(axis=2)[:, None]
+        gap = np.repeat(gap[:, :, None], len(tilt), axis=2)
+        gap[..., tilts] -= tilt
         limited_z = np.clip(z, -self.max_abs_z, self.max_abs_z)
-        log_mass = (gap * (slope + 0.5 * curved_gap)).sum(axis=3)
-        log_mass += 0.5 * ((right_side * z).sum(axis=3) - log_determinant[:, :, None])
-        shift = (gap + limited_z @ directions).reshape(count, 4 * size, -1)
-        field_covariance = directions.swapaxes(2, 3) @ covariance @ directions
-        return Components(log_mass.reshape(count, -1), shift, field_covariance)
+        return Components(log_mass.reshape(len(point), -1), gap, limited_z, directions, covariance)
+
+    def find_fields(
+        self, point: np.ndarray, score: np.ndarray, information: np.ndarray, number: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the most likely fields among all; for the arguments see `condition`.
+
+        Returns
+        -------
+        evidence : ndarray, shape (n,)
+            Logarithm of the mass in all fields.
+        mode : ndarray, shape (n, 8)
+            Mean of δ in the component of the largest mass.
+        fields : ndarray of int, shape (n, number)
+            Fields with the largest masses, each by its best offset.
+        """
+        size = len(self.field)
+        number, every_field, parts = min(number, size), np.arange(size), []
+        # A few stars at a time, whose components stay in the cache of the processor.
+        for first in range(0, len(point), 32):
+            rows = slice(first, first + 32)
+            fields = np.broadcast_to(every_field, (len(point[rows]), size))
+            components = self.condition(point[rows], score[rows], information[rows], fields)
+            log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
+            likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
+            parts.append((components.evidence, components.mode, likely))
+        evidence, mode, likely = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return evidence, mode, likely
 
 
 @dataclass(frozen=True)
@@ -124,15 +156,27 @@ class Components(Rows):
     ----------
     log_mass : ndarray, shape (n, 4 f)
         Logarithms of the masses; the offsets of a field are neighbours.
-    shift : ndarray, shape (n, 4 f, 8)
-        Mean of δ in each component.
-    covariance : ndarray, shape (n, f, 8, 8)
-        Covariance of δ in each field.
+    gap : ndarray, shape (n, f, 4, 8)
+        e, which is δ for z = 0.
+    z : ndarray, shape (n, f, 4, 5)
+        Mean of z in each component.
+    directions : ndarray, shape (n, f, 5, 8)
+        Derivatives D of δ by z in each field.
+    covariance : ndarray, shape (n, f, 5, 5)
+        Covariance of z in each field.
     """
 
     log_mass: np.ndarray
-    shift: np.ndarray
+    gap: np.ndarray
+    z: np.ndarray
+    directions: np.ndarray
     covariance: np.ndarray
+
+    @cached_property
+    def shift(self) -> np.ndarray:
+        """Mean of δ in each component, (n, 4 f, 8)."""
+        shift = self.gap + self.z @ self.directions
+        return np.asarray(shift.reshape(*self.log_mass.shape, -1))
 
     @property
     def evidence(self) -> np.ndarray:
@@ -142,15 +186,21 @@ class Components(Rows):
     @property
     def mode(self) -> np.ndarray:
         """Mean of δ in the component of the largest mass, (n, 8)."""
-        return np.asarray(self.shift[np.arange(len(self.shift)), self.log_mass.argmax(axis=1)])
+        star, (field, offset) = np.arange(len(self.z)), np.divmod(self.log_mass.argmax(axis=1), 4)
+        z, directions = self.z[star, field, offset], self.directions[star, field]
+        return np.asarray(self.gap[star, field, offset] + (z[:, None] @ directions)[:, 0])
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (n, 8) and covariance (n, 8, 8) of δ under the mixture."""
         weight = np.exp(self.log_mass - self.evidence[:, None])
         mean = np.einsum("nk,nka->na", weight, self.shift)
         # Within the components, and between their means.
-        of_field = weight.reshape(len(weight), -1, 4).sum(axis=2)
-        covariance = np.einsum("nf,nfab->nab", of_field, self.covariance)
+        of_field = weight.reshape(len(weight), -1, 4).sum(axis=2)[..., None, None]
+        slopes, scatter = (
+            array.reshape(len(array), -1, array.shape[-1])
+            for array in (self.directions, of_field * self.covariance @ self.directions)
+        )
+        covariance = slopes.swapaxes(1, 2) @ scatter
         offsets = (self.shift - mean[:, None]) * np.sqrt(weight)[:, :, None]
         return mean, covariance + offsets.swapaxes(1, 2) @ offsets
 
@@ -254,8 +304,32 @@ class NetworkStarts(NamedTuple):
         points = WavefrontCoordinates.decode(wavefront, pixel)
         return cls(points, precision, np.exp(log_weight), psf, sigma**2)
 
+    def scatter(self, stars: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return all K wavefronts of stars (n,), and draws around them, star after star.
 
-class RefinedPsfs(NamedTuple):
+        A draw is limited to errors of the coefficients of half a wave.
+
+        Returns
+        -------
+        points : ndarray, shape (n K (1 + draws), 8)
+            Coefficients.
+        precision : ndarray, shape (n K (1 + draws), 8, 8)
+            Inverse covariances of their errors.
+        """
+        points, precision = self.points[stars, :, None], self.precision[stars, :, None]
+        size = points.shape[-1]
+        # μ + L⁻ᵀ u with the precision L Lᵀ; the same normal u for all stars, which do not depend on
+        # each other in this way.
+        root = np.linalg.cholesky(precision + 4.0 * np.eye(size))
+        normal = np.random.default_rng(0).standard_normal((points.shape[1], draws, size, 1))
+        drawn_points = points + np.linalg.solve(root.swapaxes(-1, -2), normal)[..., 0]
+        all_points = np.concatenate([points, drawn_points], axis=2)
+        all_precisions = np.broadcast_to(precision, (*all_points.shape, size))
+        return all_points.reshape(-1, size), all_precisions.reshape(-1, size, size)
+
+
+@dataclass(frozen=True)
+class RefinedPsfs(Rows):
     """Posterior means of n stars about their refined wavefronts.
 
     Attributes
@@ -303,6 +377,12 @@ class Refiner:
     max_gap : float
         Difference in the logarithm of the evidence of first expansions, below which a proposal is
         refined.
+    misfit_sigma : float
+        Excess of χ² in standard deviations, above which a star is not explained by its wavefronts.
+    draws : int
+        Draws around each proposal of such a star.
+    search_steps : int
+        Damped steps from these draws.
     fields_kept : int
         Fields that expansions after the first one consider, the most likely of the first.
     batch : int
@@ -320,6 +400,9 @@ class Refiner:
     max_proposals: ClassVar[int] = 8
     min_weight: ClassVar[float] = 0.05
     max_gap: ClassVar[float] = 6.0
+    misfit_sigma: ClassVar[float] = 4.0
+    draws: ClassVar[int] = 2
+    search_steps: ClassVar[int] = 3
     fields_kept: ClassVar[int] = 24
     batch: ClassVar[int] = 128
     sampling: ClassVar[float] = 0.85
@@ -336,7 +419,7 @@ class Refiner:
         return SampledStamps(
             self.obscuration,
             monomial_images,
-            PointSampling,
+            ImageSampling,
             self.stamp_px,
             self.prior.pixel,
             "complex64",
@@ -344,15 +427,10 @@ class Refiner:
             batch=32 * len(MONOMIALS),
         )
 
-    def expand(
-        self,
-        point: np.ndarray,
-        counts: np.ndarray,
-        flux: np.ndarray,
-        fields: np.ndarray,
-        damping: np.ndarray | float = 0.0,
-    ) -> Expansion:
-        """Expand the posteriors of n stars about wavefronts.
+    def measure(
+        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, Evaluation]:
+        """Propagate the stamps of n wavefronts, and compare them with photons.
 
         Parameters
         ----------
@@ -362,11 +440,13 @@ class Refiner:
             Photons in every pixel, sky included.
         flux : ndarray, shape (n,)
             Photons F of each star.
-        fields : ndarray of int, shape (n, f)
-            Fields that are considered for each star.
-        damping : ndarray, shape (n, 8, 8)
-            Inverse covariance of a normal distribution about the points, another factor of the
-            posterior.
+
+        Returns
+        -------
+        stamps, slopes : ndarray, shapes (n, P) and (n, 8, P)
+            Stamps of sum 1, and their derivatives by c.
+        likelihood : Evaluation
+            −2 ln L(c⁰), g and M.
         """
         axes = np.broadcast_to(np.eye(len(MONOMIALS)), (len(point), *[len(MONOMIALS)] * 2))
         # The count of samples holds for the steepest slopes, which few rays have.
@@ -377,19 +457,23 @@ class Refiner:
         stamps = stamps.reshape(len(point), -1).astype(np.float64)
         slopes = slopes.reshape(len(point), len(MONOMIALS), -1).astype(np.float64)
         # Poisson likelihood of the counts, of mean F p + B.
-        deviance, score, information = poisson_information(
-            counts,
-            flux[:, None] * stamps + self.noise.background,
-            flux[:, None, None] * slopes,
-        )
-        components = self.prior.condition(point, score, information + damping, fields)
+        mean_counts = flux[:, None] * stamps + self.noise.background
+        likelihood = poisson_information(counts, mean_counts, flux[:, None, None] * slopes)
+        return stamps, slopes, likelihood
+
+    def expand(
+        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
+    ) -> Expansion:
+        """Expand posteriors about wavefronts in the fields (n, f) of each; see `measure`."""
+        stamps, slopes, (deviance, score, information) = self.measure(point, counts, flux)
+        components = self.prior.condition(point, score, information, fields)
         return Expansion(point, stamps, slopes, deviance, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
         """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
 
         Proposals are tried up to a total probability, and refined unless the first expansion of
-        another one has much more evidence.
+        another one has much more evidence. A star that no wavefront explains is searched anew.
         """
         count, pixels = len(noisy), self.stamp_px**2
         flux = self.noise.flux(level)
@@ -397,7 +481,7 @@ class Refiner:
         images = noisy.reshape(count, pixels).astype(np.float64)
         counts = np.rint(flux[:, None] * images) + self.noise.background
         psf, variance = np.zeros((2, count, pixels))
-        evidence = np.full(count, -np.inf)
+        results = RefinedPsfs(psf, variance, np.full(count, -np.inf))
         # Proposals that are preceded by less than the total probability.
         is_likely = np.cumsum(starts.weight, axis=1) - starts.weight < 1.0 - self.min_weight
         is_likely[:, self.max_proposals :] = False
@@ -405,21 +489,69 @@ class Refiner:
             star, number = np.nonzero(is_likely[first : first + self.batch])
             star += first
             start = starts.points[star, number], self.damping * starts.precision[star, number]
-            first_evidence, point, likely_fields = self.begin(*start, counts[star], flux[star])
-            # Near the best start of a star no other one is needed, nor with much less evidence.
-            order = np.lexsort((-first_evidence, star))
-            star, point, likely_fields = star[order], point[order], likely_fields[order]
-            gap = group_maximum(first_evidence[order], star) - first_evidence[order]
-            is_used = self.find_distinct(star, point) & (gap <= self.max_gap)
-            starting = star[is_used], point[is_used], likely_fields[is_used]
-            star, expansion = self.follow(*starting, counts, flux)
-            # Means over the wavefronts of a star, with their posterior probabilities.
-            np.logaddexp.at(evidence, star, expansion.evidence)
-            weight = np.exp(expansion.evidence - evidence[star])[:, None]
-            mean, scatter = expansion.moments()
-            np.add.at(psf, star, weight * mean)
-            np.add.at(variance, star, weight * (scatter + (mean - psf[star]) ** 2))
-        return RefinedPsfs(psf, variance, evidence)
+            results.put(*self.climb(star, *start, counts, flux, steps=1))
+        # χ² of stars that none of their wavefronts explains is too large. They are searched in
+        # several steps, from all proposals and from draws of their Gaussians.
+        mean_counts = flux[:, None] * psf + self.noise.background
+        chi2 = (np.square(counts - mean_counts) / np.maximum(mean_counts, 1.0)).sum(axis=1)
+        limit = compute_deviance_limit(pixels, self.misfit_sigma)
+        unexplained = np.flatnonzero(chi2 > limit)
+        for first in range(0, len(unexplained), self.batch // 8):
+            stars = unexplained[first : first + self.batch // 8]
+            points, damping = starts.scatter(stars, self.draws)
+            star = np.repeat(stars, len(points) // len(stars))
+            start = points, self.damping * damping
+            results.put(*self.climb(star, *start, counts, flux, steps=self.search_steps))
+        return results
+
+    def climb(
+        self,
+        star: np.ndarray,
+        point: np.ndarray,
+        damping: np.ndarray,
+        counts: np.ndarray,
+        flux: np.ndarray,
+        steps: int,
+    ) -> tuple[np.ndarray, RefinedPsfs]:
+        """Return the numbers (m,) of stars, and their posterior means from starts.
+
+        Parameters
+        ----------
+        star : ndarray of int, shape (n,)
+            Stars of the starts.
+        point, damping : ndarray, shapes (n, 8) and (n, 8, 8)
+            Coefficients, and inverse covariances that limit a step.
+        counts, flux : ndarray, shapes (N, P) and (N,)
+            Photons of all stars; see `measure`.
+        steps : int
+            Damped steps, after each of which the most likely wavefronts are kept.
+        """
+        for step in range(steps):
+            evidence, point, fields = self.begin(point, damping, counts[star], flux[star])
+            # Near the best wavefront of a star no other one is needed, nor with much less evidence.
+            order = np.lexsort((-evidence, star))
+            star, evidence, point, damping, fields = (
+                array[order] for array in (star, evidence, point, damping, fields)
+            )
+            is_used = self.find_distinct(star, point)
+            if step + 1 < steps:
+                is_used &= rank_in_group(star, -evidence) < self.max_proposals
+            else:
+                is_used &= group_maximum(evidence, star) - evidence <= self.max_gap
+            star, point, damping, fields = (
+                array[is_used] for array in (star, point, damping, fields)
+            )
+        star, expansion = self.follow(star, point, fields, counts, flux)
+        # Means over the wavefronts of a star, with their posterior probabilities.
+        stars, number = np.unique(star, return_inverse=True)
+        evidence = np.full(len(stars), -np.inf)
+        np.logaddexp.at(evidence, number, expansion.evidence)
+        weight = np.exp(expansion.evidence - evidence[number])[:, None]
+        mean, scatter = expansion.moments()
+        psf, variance = np.zeros((2, len(stars), counts.shape[1]))
+        np.add.at(psf, number, weight * mean)
+        np.add.at(variance, number, weight * (scatter + (mean - psf[number]) ** 2))
+        return stars, RefinedPsfs(psf, variance, evidence)
 
     @cached_property
     def root(self) -> np.ndarray:
@@ -546,15 +678,11 @@ class Refiner:
         fields : ndarray of int, shape (n, f)
             The most likely fields.
         """
-        every_field = np.arange(len(self.prior.field))
-        fields = np.broadcast_to(every_field, (len(point), every_field.size))
-        expansion = self.expand(point, counts, flux, fields, damping)
-        components = expansion.components
-        # The most likely fields, by the best offset of each.
-        log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
-        number = min(self.fields_kept, every_field.size)
-        likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
-        return expansion.evidence, point + components.mode, likely
+        *_, (deviance, score, information) = self.measure(point, counts, flux)
+        evidence, step, fields = self.prior.find_fields(
+            point, score, information + damping, self.fields_kept
+        )
+        return evidence - 0.5 * deviance, point + step, fields
 
 
 def list_partners(group: np.ndarray) -> Iterator[np.ndarray]:

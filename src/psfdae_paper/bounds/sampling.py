@@ -2,10 +2,10 @@
 
 The input is the modes of the stars' posteriors, the output sums over weighted draws, from which the
 posterior mean of each star is computed. Coefficients are drawn around all modes, from a mixture of
-Student's t distributions. The mixture is adapted to its own draws (`psfdae_paper.bounds.mixture`),
-and the draws of all rounds are weighted by prior × likelihood over the density of all rounds
-together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
-brightest pixel the simulator would not frame at o get weight 0.
+Student's t distributions. The mixture is adapted to its own draws (`Modes.adapt`), and the draws of
+all rounds are weighted by prior × likelihood over the density of all rounds together (Cornuet et
+al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose brightest pixel the simulator
+would not frame at o get weight 0.
 
 The Markov chains of `psfdae.sensing.sampling` cannot replace it: evidence for a bound needs weights
 of independent draws, in parts and with an effective size. Nor can it replace the chains: in the
@@ -214,7 +214,8 @@ class _Sampler:
         # The density of draws from all rounds together is Σ_modes number × density of the mode.
         with np.errstate(divide="ignore"):
             log_density = [
-                np.log(number)[:, None] + modes.log_density(draws.z, draws.field, draws.offset)
+                np.log(number)[:, None]
+                + modes.log_density(draws, modes.compute_squared_distance(draws.z))
                 for modes, number in self.mixtures
             ]
         total = np.logaddexp.reduce(np.concatenate(log_density), axis=0)

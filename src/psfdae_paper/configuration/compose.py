@@ -15,8 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -24,7 +23,7 @@ from typing import Any, TypeVar, cast
 from psfdae.base.errors import did_you_mean
 from psfdae.base.files import ProductError, write_text
 from psfdae.base.reading import parse_yaml
-from psfdae.base.settings import NEUTRAL, ConfigError, Group, leaves, parse_settings
+from psfdae.base.settings import ConfigError, Group, dump_deciding, leaves, parse_settings
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import build_stage_class, fill_derived_values
@@ -261,19 +260,9 @@ def load_file(model: type[Model], path: Path, name: str | None = None) -> Model:
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
     tree = tree if isinstance(tree, dict) else {}
-    with _name_in_errors(path if name is None else f"{path}: {name}"):
-        return parse_settings(model, tree if name is None else tree[name])
-
-
-@contextmanager
-def _name_in_errors(path: Path | str) -> Iterator[None]:
-    """Begin each line of a ConfigError with the name of the file that is checked."""
-    try:
-        yield
-    except ConfigError as error:
-        # An error may have several lines, one for each key.
-        lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
-        raise ConfigError(lines) from None
+    if name is None:
+        return parse_settings(model, tree, path)
+    return parse_settings(model, tree[name], f"{path}: {name}")
 
 
 def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
@@ -321,16 +310,11 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     # A file that is not a mapping lacks all groups.
     groups = tree if isinstance(tree, dict) else {}
     # All groups of the file are checked: one that the stage does not read is rejected.
-    with _name_in_errors(path):
-        return _check_groups(reads, groups)
+    return _check_groups(reads, groups, path)
 
 
 def write_settings(
-    folder: Path,
-    stage: str,
-    reads: tuple[str, ...],
-    tree: Mapping[str, Any],
-    dry: bool = False,
+    folder: Path, stage: str, reads: tuple[str, ...], tree: Mapping[str, Any], dry: bool = False
 ) -> Path:
     """Write the checked groups that a stage reads; the same settings have the same file name.
 
@@ -357,12 +341,12 @@ def write_settings(
     import yaml
 
     # Checked values in the order of the classes.
-    settings = part(reads, select_stage_groups(reads, tree)).model_dump()
+    settings = part(reads, select_stage_groups(reads, tree))
     # Another name makes Snakemake repeat a job.
     path = folder / f"{stage.replace(' ', '-')}-{_hash_settings(settings)[:16]}.yaml"
     # A dry run writes nothing; jobs on other machines read the same file.
     if not dry:
-        text = yaml.safe_dump(settings, sort_keys=True, allow_unicode=True)
+        text = yaml.safe_dump(settings.model_dump(), sort_keys=True, allow_unicode=True)
         # A file that is damaged, or has other neutral settings, is written again.
         if not (path.is_file() and path.read_bytes() == text.encode()):
             write_text(path, text)
@@ -385,12 +369,12 @@ def hash_groups(reads: tuple[str, ...], tree: Mapping[str, Any]) -> str:
         Names each wrong key with its value and the allowed range.
     """
     # Checked values: 1 and 1.0 are the same number.
-    return _hash_settings(part(reads, select_stage_groups(reads, tree)).model_dump())
+    return _hash_settings(part(reads, select_stage_groups(reads, tree)))
 
 
-def _hash_settings(settings: Mapping[str, Any]) -> str:
+def _hash_settings(settings: Group) -> str:
     """Return the SHA-256 of the settings that can change a result."""
-    settings_text = json.dumps(drop_neutral_settings(settings), sort_keys=True)
+    settings_text = json.dumps(dump_deciding(settings), sort_keys=True)
     return hashlib.sha256(settings_text.encode()).hexdigest()
 
 
@@ -416,10 +400,11 @@ def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     return _check_groups(reads, groups)
 
 
-def _check_groups(reads: tuple[str, ...], groups: Mapping[str, Any]) -> Config:
-    """Return checked groups, annotated as a whole `Config` as in the stages."""
+def _check_groups(reads: tuple[str, ...], groups: Mapping[str, Any], source: object = "") -> Config:
+    """Return checked groups of a file, annotated as a whole `Config` as in the stages."""
     # `build_stage_class` makes a class of these groups alone.
-    return cast(Config, parse_settings(build_stage_class(reads, build_config_class()), groups))
+    stage_class = build_stage_class(reads, build_config_class())
+    return cast(Config, parse_settings(stage_class, groups, source))
 
 
 def select_stage_groups(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -527,35 +512,6 @@ def list_datasets() -> list[str]:
 def _key(override: str) -> str:
     """Return the key of an override such as `+group.key=value` or `group@package=option`."""
     return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
-
-
-def drop_neutral_settings(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration tree without the settings that cannot change a result.
-
-    These are marked `NEUTRAL` in their class, such as the time between checkpoints.
-
-    Parameters
-    ----------
-    tree : mapping
-        Groups by name, as values.
-
-    Returns
-    -------
-    dict
-        Input of the hash: settings with the same hash give the same result.
-    """
-    neutral = {
-        (group, name)
-        for group, group_class in _group_classes().items()
-        for name, field in group_class.model_fields.items()
-        if NEUTRAL in field.metadata
-    }
-    return {
-        group: {key: value for key, value in values.items() if (group, key) not in neutral}
-        if isinstance(values, Mapping)
-        else values
-        for group, values in tree.items()
-    }
 
 
 def _first_lines(error: Exception) -> str:

@@ -114,11 +114,6 @@ def tabulate_correlations(
     return rows
 
 
-def tabulate_error_correlations(key: Key, errors: np.ndarray) -> list[Row]:
-    """Return correlations of signed errors (n, 4) with 95 % intervals."""
-    return tabulate_correlations(key, *correlate_errors(errors))
-
-
 def tabulate_bound_correlations(key: Key, covariances: np.ndarray) -> list[Row]:
     """Return correlations that the Fisher matrix predicts, for single and for all states.
 
@@ -252,10 +247,8 @@ def compute_fisher_interval(
     return np.tanh(z - half_width), np.tanh(z + half_width)
 
 
-def correlate_errors(
-    errors: np.ndarray, confidence: float = 0.95
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Pearson correlations of signed errors with intervals from Fisher's z.
+def correlate_errors(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Pearson correlations of signed errors with 95 % intervals from Fisher's z.
 
     z = artanh r is nearly normal with the standard error 1/√(n − 3) for
     independent, jointly normal errors (Fisher 1921, Metron 1, 3).
@@ -264,8 +257,6 @@ def correlate_errors(
     ----------
     errors : ndarray, shape (n, k)
         One row per sample, one column per parameter, any unit.
-    confidence : float
-        Probability of the two-sided interval, 0 … 1.
 
     Returns
     -------
@@ -280,8 +271,6 @@ def correlate_errors(
     ValueError
         If there are no samples, or an error is not finite.
     """
-    from scipy.stats import norm
-
     errors = np.asarray(errors, np.float64)
     if not errors.size or not np.isfinite(errors).all():
         raise ValueError(f"errors of shape {errors.shape}: must be at least one and all finite")
@@ -294,8 +283,8 @@ def correlate_errors(
     length = np.where(varies, np.sqrt((deviation**2).sum(axis=0)), 1.0)
     matrix = np.clip((deviation / length).T @ (deviation / length), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    # The interval is undefined for fewer than four samples.
-    low, high = compute_fisher_interval(matrix, count, norm.isf(0.5 * (1.0 - confidence)))
+    # The interval, 1.96 σ to either side, is undefined for fewer than four samples.
+    low, high = compute_fisher_interval(matrix, count, 1.959963984540054)
     if count < 4:
         off_diagonal = ~np.eye(len(matrix), dtype=bool)
         low[off_diagonal] = high[off_diagonal] = np.nan

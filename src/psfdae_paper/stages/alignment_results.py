@@ -192,7 +192,8 @@ def tables(
             error = values - truth
             error_rows += alignment_tables.tabulate_errors(key, error, unit)
             if key["method"] != "constant":
-                correlation_rows += alignment_tables.tabulate_error_correlations(key, error)
+                correlations = alignment_tables.correlate_errors(error)
+                correlation_rows += alignment_tables.tabulate_correlations(key, *correlations)
     # Rows by test set, noise level, and the order in which methods are listed.
     for path, rows in ((errors, error_rows), (correlation, correlation_rows)):
         frame = pd.DataFrame(rows)

@@ -227,10 +227,7 @@ def figure_curves(
 
 @command("paper figure errors")
 def figure_errors(
-    dataset: str,
-    evaluations: Evaluations,
-    out: tuple[tuple[Metric, File], ...],
-    note: Note = "",
+    dataset: str, evaluations: Evaluations, out: tuple[tuple[Metric, File], ...], note: Note = ""
 ) -> None:
     """Draw metrics against the noise level, with the paper's points.
 

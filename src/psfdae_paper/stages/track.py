@@ -328,11 +328,10 @@ def create_run(client: MlflowClient, experiment: str, run: TrackedRun, tags: dic
     # Metrics of the finished run, then of each epoch.
     log_metrics(client, run_id, [(0, end_ms, {**run.metrics, **run.best_validation})], **origin)
     log_metrics(client, run_id, list_epochs(run.epochs, start_ms))
-    # All settings are parameters; MLflow takes 100 at once, with 6000 characters of each.
+    # All settings are parameters; MLflow takes 6000 characters of each.
     texts = run.params | {"preset": tags["preset"]}
     params = [Param(name, text[:6000]) for name, text in texts.items()]
-    for i in range(0, len(params), 100):
-        client.log_batch(run_id, params=params[i : i + 100])
+    client.log_batch(run_id, params=params)
     # Files have the same names as in the results folder; the model holds the files of a fit.
     for path in (*run.files, *(() if run.bundle else run.fit_files)):
         client.log_artifact(run_id, str(path), str(path.parent.relative_to(run.root)))
@@ -384,9 +383,7 @@ def log_metrics(
         for name, value in starmap(tracking.convert_metric, row.items())
         if math.isfinite(value)
     ]
-    # MLflow takes 1000 at once.
-    for i in range(0, len(metrics), 1000):
-        client.log_batch(run_id, metrics[i : i + 1000])
+    client.log_batch(run_id, metrics)
 
 
 def make_tags(run: TrackedRun) -> dict[str, str]:

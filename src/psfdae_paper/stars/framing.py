@@ -15,13 +15,7 @@ import numpy as np
 from psfdae.base.errors import Error
 from psfdae.base.files import Product
 from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, run_grids
-from psfdae.optics.pupil import (
-    Pupil,
-    SamplingError,
-    annular_pupil,
-    choose_samples,
-    count_samples,
-)
+from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil, choose_samples, count_samples
 from psfdae.optics.seeing import BlurredPropagator
 from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.telescope.settings import OwnTelescope, Telescope

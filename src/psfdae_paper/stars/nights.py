@@ -36,13 +36,7 @@ PLACES = {
 }
 """Positions where the PSF of an image is measured: x and y over numbers of columns and rows."""
 
-FAULTS = {
-    0.14: "clouds",
-    0.37: "trailed",
-    0.55: "truncated file",
-    0.74: "clouds",
-    0.87: "no stars",
-}
+FAULTS = {0.14: "clouds", 0.37: "trailed", 0.55: "truncated file", 0.74: "clouds", 0.87: "no stars"}
 """Fault of the exposure after this fraction of the night."""
 
 

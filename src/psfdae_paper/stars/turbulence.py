@@ -29,6 +29,9 @@ SPECTRUM_FACTOR = gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3)) * (24 / 5 * gamma
 Its last factor is half of Fried's 6.88, by which r0 is defined: D(r) = 6.88 (r/r0)^(5/3).
 """
 
+PER_RING = 8
+"""Plane waves in a ring of the frequency plane; their angles are stratified."""
+
 
 def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
     """Return Fried's parameter of each layer in metres, r0_l = r0 · s_l^(−3/5).
@@ -56,12 +59,7 @@ class PlaneWaves:
 
 
 def draw_waves(
-    count: int,
-    r0: float,
-    outer_scale: float,
-    highest: float,
-    rng: np.random.Generator,
-    per_ring: int = 8,
+    count: int, r0: float, outer_scale: float, highest: float, rng: np.random.Generator
 ) -> PlaneWaves:
     """Draw plane waves whose ensemble has the von Kármán spectrum up to a frequency.
 
@@ -78,7 +76,7 @@ def draw_waves(
     Parameters
     ----------
     count : int
-        Number K of waves, a multiple of `per_ring`.
+        Number K of waves, a multiple of `PER_RING`, at least two rings.
     r0, outer_scale : float
         In metres.
     highest : float
@@ -86,20 +84,13 @@ def draw_waves(
         beyond it is 0.086 (r0 · highest)^(−5/3) rad².
     rng : Generator
         Random stream of the layer.
-    per_ring : int
-        Waves in a ring of the frequency plane; their angles are stratified.
 
     Raises
     ------
     ValueError
-        If `count` does not fill at least two rings or `highest` is not above
-        the innermost disc.
+        If `highest` is not above the innermost disc.
     """
-    rings, remainder = divmod(count, per_ring)
-    if remainder or rings < 2:
-        raise ValueError(
-            f"{count} plane waves: must be a multiple of {per_ring}, at least {2 * per_ring}"
-        )
+    rings = count // PER_RING
     # Edges of the rings: a disc of radius 1/(2 L0) around f = 0, then equal steps of ln f.
     outer_frequency = 1.0 / outer_scale
     if highest <= 0.5 * outer_frequency:
@@ -109,12 +100,12 @@ def draw_waves(
     # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6), with f0 = 1/L0.
     integral = (edges**2 + outer_frequency**2) ** (-5.0 / 6.0)
     ring_integral = integral[:-1] - integral[1:]
-    power = 2.0 * np.pi * SPECTRUM_FACTOR * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / per_ring
+    power = 2.0 * np.pi * SPECTRUM_FACTOR * r0 ** (-5.0 / 3.0) * 0.6 * ring_integral / PER_RING
     # Radii by inversion of that integral; a wave's angle lies in its own part of the half-turn.
-    radius_draw, angle_draw, phase_draw = rng.random((3, rings, per_ring))
+    radius_draw, angle_draw, phase_draw = rng.random((3, rings, PER_RING))
     drawn_integral = integral[:-1, None] - radius_draw * ring_integral[:, None]
     radius = np.sqrt(np.maximum(drawn_integral ** (-6.0 / 5.0) - outer_frequency**2, 0.0))
-    angle = np.pi * (np.arange(per_ring) + angle_draw) / per_ring
+    angle = np.pi * (np.arange(PER_RING) + angle_draw) / PER_RING
     frequency = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     # The real part of a·exp(iφ) has the variance |a|²/2.
     amplitude = np.sqrt(2.0 * power)[:, None] * np.exp(2j * np.pi * phase_draw)

@@ -114,11 +114,7 @@ def average_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, f
 
 
 def measure_images(
-    config: Config,
-    task: Task,
-    method: str,
-    validate_with: Method,
-    test_with: Method,
+    config: Config, task: Task, method: str, validate_with: Method, test_with: Method
 ) -> dict[str, float]:
     """Measure a model on validation and test stars, and write both tables.
 

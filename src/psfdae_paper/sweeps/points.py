@@ -14,11 +14,11 @@ from functools import cached_property
 from typing import Any
 
 from psfdae.base.errors import Error, did_you_mean
-from psfdae.base.settings import ConfigError, leaves
+from psfdae.base.settings import ConfigError, dump_deciding, leaves
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import (
     compose,
-    drop_neutral_settings,
+    part,
     select_overrides,
     select_stage_groups,
     validate_tree,
@@ -180,7 +180,7 @@ class Plan:
             "reference": self.sweep.reference,
             "levels": self.levels,
             "data": self.data_config,
-            "config": drop_neutral_settings(config),
+            "config": dump_deciding(part(self.sweep.reads, config)),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
         # 12 hexadecimal digits: among 1e5 points, two names agree by chance once in 5e4 sweeps.

@@ -182,21 +182,11 @@ def bundle_memory(suffix: str) -> int:
     return max(1500, fit_resources(bundle_suffixes()[suffix])["mem_mb"])
 
 
-def get_bundle_method(wildcards: Wildcards) -> str:
-    """Return the method of a bundle, whose name ends in the wildcard `suffix`."""
-    return bundle_suffixes()[wildcards.suffix]
-
-
-def list_bundle_inputs(run: Run, wildcards: Wildcards) -> list[str]:
-    """Return the files of the fit from which a bundle is written."""
-    key = (wildcards.dataset, wildcards.split, wildcards.reference)
-    return fit_outputs(run, get_bundle_method(wildcards), *key)
-
-
-def get_bundle_option(run: Run, wildcards: Wildcards) -> str:
-    """Return the option that gives a command this fit."""
-    key = (wildcards.dataset, wildcards.split, wildcards.reference)
-    return fit_option(run, get_bundle_method(wildcards), *key)
+def identify_fit(wildcards: Wildcards) -> tuple[str, str, str, str]:
+    """Return method, dataset, split and reference of the fit from which a bundle is written."""
+    # The suffix of a bundle names its method.
+    name = bundle_suffixes()[wildcards.suffix]
+    return name, wildcards.dataset, wildcards.split, wildcards.reference
 
 
 def seed_fits(run: Run, wildcards: Wildcards) -> list[str]:

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Protocol
 
 from psfdae.base.reading import read_table, read_yaml
-from psfdae.base.settings import as_literal, leaves
+from psfdae.base.settings import as_literal, dump_deciding, leaves
 from psfdae.methods import method
-from psfdae_paper.configuration.compose import drop_neutral_settings
 from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.workflow.fits import method_names
 from psfdae_paper.workflow.run import SCENE3, Run, list_default_datasets, load_dataset_config
@@ -69,7 +68,7 @@ def find_differences(run: Run, dataset: str) -> Differences:
     base = {variant.name: variant.dataset for variant in run.variants}.get(dataset, dataset)
     paper_run = Run("paper", ("preset=paper",), run.results)
     values, paper_values = (
-        dict(leaves(drop_neutral_settings(load_dataset_config(*choice).model_dump())))
+        dict(leaves(dump_deciding(load_dataset_config(*choice))))
         for choice in ((run, dataset), (paper_run, base))
     )
     # Scene 3 has only groups of its own; other datasets also have groups of targets on request.

@@ -22,13 +22,7 @@ from psfdae.base.files import as_yaml, write_text
 from psfdae.base.reading import read_yaml
 from psfdae.base.settings import ConfigError, Group, Name, parse_settings
 from psfdae.commands.cli import stage
-from psfdae_paper.configuration.compose import (
-    compose,
-    load,
-    part,
-    select_overrides,
-    write_settings,
-)
+from psfdae_paper.configuration.compose import compose, load, part, select_overrides, write_settings
 from psfdae_paper.configuration.experiment import Variant, load_experiment
 from psfdae_paper.configuration.methods import list_noise_warnings
 from psfdae_paper.configuration.schema import Config
@@ -393,7 +387,10 @@ def import_benchmark(name: str) -> Any:
 
 
 def hash_code(*names: str) -> Callable[[Wildcards], str]:
-    """Return a parameter with the hash of commands and modules, computed where a job needs it."""
+    """Return a parameter with the hash of some code, computed where a job needs it.
+
+    Names are commands, modules, or programs such as workflow/benchmarks/costs.py.
+    """
     return lambda wildcards: source_hash(*names)
 
 
@@ -405,16 +402,6 @@ def locate_program(name: str) -> Callable[[Wildcards, int], str]:
     """
     file, command = name.split(".")
     return lambda wildcards, threads: f"{BENCHMARKS}/{file}.py {command}"
-
-
-def program_code(name: str, *stages: str) -> str:
-    """Return the hash of a program, such as "costs.cost", and of the stages that it runs."""
-    return source_hash(f"workflow/benchmarks/{name.partition('.')[0]}.py", *stages)
-
-
-def hash_program(name: str, *stages: str) -> Callable[[Wildcards], str]:
-    """Return a parameter with the hash of `program_code`, computed where a job needs it."""
-    return lambda wildcards: program_code(name, *stages)
 
 
 def stress_code() -> str:

@@ -10,6 +10,7 @@ from psfdae_paper.configuration.sweep import find_sweeps
 from psfdae_paper.source import source_hash
 from psfdae_paper.sweeps.figures import ALL_AXES, TWO_AXES
 from psfdae_paper.sweeps.points import Plan, Point, SweepError, plan_sweep
+from psfdae_paper.workflow.alignment import training_states
 from psfdae_paper.workflow.datasets import stars_file
 from psfdae_paper.workflow.run import Run, Wildcards, exit_in_one_line
 
@@ -48,7 +49,7 @@ def sweep_data(run: Run, name: str) -> dict[str, str]:
         return {"stars": stars_file(run, sweep.dataset)}
     folder = f"{run.results}/data/alignment"
     return {
-        "states": f"{folder}/{'grid' if sweep.model == 'original' else 'train'}.h5",
+        "states": training_states(run, sweep.model),
         "validation": f"{folder}/validation.h5",
         "test": f"{folder}/uniform.h5",
     }

@@ -28,6 +28,7 @@ from psfdae.methods.field.nodes import node_step
 from psfdae.methods.field.pairs import FieldStamps
 from psfdae.methods.field.posterior import log_node_prior, match_flux
 from psfdae.methods.field.prior import FieldPrior, PosteriorLimits
+from psfdae.methods.field.residuals import find_components
 from psfdae.methods.field.search import fit_field
 from psfdae.methods.interface import TrainingSet
 from psfdae.psf.interface import PredictionError
@@ -727,3 +728,15 @@ def test_a_star_is_a_misfit_if_its_pixels_are_2_per_cent_off(depth, is_misfit):
     )
     checked = reject_misfits(candidates, settings, None)
     assert np.flatnonzero(checked.verdict == Verdict.MISFIT).tolist() == [7] * is_misfit
+
+
+@pytest.mark.parametrize("shape", [(30, 12), (12, 30), (1, 9)])
+def test_components_of_residuals_are_their_singular_vectors(shape):
+    rows = np.random.default_rng(1).normal(size=shape)
+    rows[:, 0] = 0.0
+    square, axes = find_components(rows)
+    _, size, singular_vectors = np.linalg.svd(rows, full_matrices=False)
+    assert_allclose(square, size**2, atol=1e-10)
+    assert_allclose((axes.T * square) @ axes, rows.T @ rows, atol=1e-10)
+    cosine = np.abs((axes * singular_vectors).sum(axis=1))
+    assert_allclose(cosine[size > 1e-9], 1.0, atol=1e-10)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
+from psfdae.optics.derivatives import (
+    ImageSampling,
+    ModalStamps,
+    PeriodSampling,
+    PointSampling,
+)
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
@@ -63,6 +68,21 @@ def test_airy_encircled_energy(samples, operator):
     for inside in (1.2197, 2.2331, 3.2383):
         expected = 1 - j0(np.pi * inside) ** 2 - j1(np.pi * inside) ** 2
         assert image[radius < inside].sum() == pytest.approx(expected, abs=5e-5)
+
+
+@pytest.mark.parametrize("samples", [48, 144])
+def test_derivatives_from_the_image_are_those_of_propagated_products(samples):
+    pupil, pixel = annular_pupil(samples, 0.3), 0.88
+    coefficients = np.stack([0.2 * COMATIC, -0.1 * COMATIC])
+    (stamps, slopes), (same_stamps, from_image) = (
+        ModalStamps(pupil, monomial_images, kind(pupil, 16, pixel, "complex64"), pixel).derivatives(
+            coefficients, np.eye(8)[None]
+        )
+        for kind in (PointSampling, ImageSampling)
+    )
+    assert same_stamps == pytest.approx(stamps, abs=1e-6 * float(stamps.max()))
+    error = np.linalg.norm((from_image - slopes).reshape(2, 8, -1), axis=2)
+    assert (error < 3e-4 * np.linalg.norm(slopes.reshape(2, 8, -1), axis=2)).all()
 
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])

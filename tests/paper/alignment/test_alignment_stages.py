@@ -51,7 +51,8 @@ def test_rows_of_errors_and_bounds_agree_on_normal_errors():
 
 def test_measured_correlations_are_those_predicted():
     errors, covariances = ERRORS[:600], np.broadcast_to(COVARIANCE, (600, 4, 4))
-    measured = pd.DataFrame(alignment_tables.tabulate_error_correlations(CELL, errors))
+    correlations = alignment_tables.correlate_errors(errors)
+    measured = pd.DataFrame(alignment_tables.tabulate_correlations(CELL, *correlations))
     predicted = pd.DataFrame(alignment_tables.tabulate_bound_correlations(CELL, covariances))
     assert len(measured) == 16
     pooled = predicted[predicted.method == "cramer_rao_pooled"].reset_index(drop=True)

@@ -10,7 +10,6 @@ from scipy.stats import multivariate_t
 
 from psfdae.base.rng import stream
 from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae_paper.bounds.mixture import Mixture
 from psfdae_paper.bounds.mode_search import (
     climb,
     find_twins,
@@ -19,7 +18,7 @@ from psfdae_paper.bounds.mode_search import (
     recentre,
     select_best,
 )
-from psfdae_paper.bounds.modes import Knowledge, Modes
+from psfdae_paper.bounds.modes import Knowledge, Modes, Positions
 from psfdae_paper.bounds.posterior import Likelihood, list_jitters, merge
 from psfdae_paper.bounds.sampling import sample_posterior
 from psfdae_paper.bounds.stamp_model import StampModel, StarPosteriors
@@ -183,10 +182,10 @@ def test_density_of_draws_is_students_t():
     modes = replace(start, factor=factor)
     z, field = rng.normal(0, 3, (30, 5)), np.arange(30) % 2
     offset = np.where(np.arange(30) < 20, modes.offset[field].T, 7).T
-    density = modes.log_density(z, field, offset)
+    density = modes.log_density(Positions(field, offset, z), modes.compute_squared_distance(z))
     for mode in number:
         scale = factor[mode] @ factor[mode].T
-        law = multivariate_t(modes.z[mode], scale, Mixture.freedom)
+        law = multivariate_t(modes.z[mode], scale, Modes.freedom)
         at_mode = (field == mode) & (np.arange(30) < 20)
         assert density[mode, at_mode] == pytest.approx(law.logpdf(z[at_mode]), abs=1e-9)
         assert (density[mode, ~at_mode] == -np.inf).all()

@@ -148,6 +148,25 @@ def test_a_second_proposal_is_used_where_the_first_one_fails(model):
     assert errors[1] == pytest.approx(errors[2], rel=0.2)
 
 
+def test_stars_that_no_proposal_explains_are_searched_anew(model, monkeypatch):
+    """Climbs from 0.25 waves in each coefficient often end at another image."""
+    count, rng = 60, np.random.default_rng(18)
+    stamps, *_, point = draw_stars(model, count, 17)
+    noisy, level = NOISE.draw(stamps, 1e-3, rng), np.full(count, 1e-3)
+    starts = propose(point[:, None] + 0.25 * rng.standard_normal((count, 2, 8)), stamps)
+    starts = starts._replace(precision=np.tile(16.0 * np.eye(8), (count, 2, 1, 1)))
+    refiner, truth = build_refiner(model), stamps.reshape(count, -1)
+    found = refiner.refine(noisy, level, starts)
+    error = np.square(found.psf - truth).mean()
+    # The result of a star does not depend on the others.
+    last = NetworkStarts(*(values[-5:] for values in starts))
+    again = refiner.refine(noisy[-5:], level[-5:], last)
+    assert again.psf == pytest.approx(found.psf[-5:], abs=1e-7)
+    monkeypatch.setattr(Refiner, "misfit_sigma", np.inf)
+    without = np.square(refiner.refine(noisy, level, starts).psf - truth).mean()
+    assert error < 0.3 * without
+
+
 def test_the_same_wavefront_is_counted_once(model):
     """A proposal close to another one adds nothing: neither to the mean nor to the evidence."""
     stamps, *_, point = draw_stars(model, 10, 13)

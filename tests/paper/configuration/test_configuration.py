@@ -288,8 +288,8 @@ def test_search_distances_follow_from_the_telescope():
 
 
 def test_settings_that_cannot_change_a_result_are_set_apart():
-    tree = compose.select_stage_groups(list_groups("dae"), compose.compose())
-    indecisive = {*as_overrides(tree)} - {*as_overrides(compose.drop_neutral_settings(tree))}
+    config = load_stage(list_groups("dae"))
+    indecisive = {*as_overrides(config.model_dump())} - {*as_overrides(dump_deciding(config))}
     assert [text.split(".", 1)[1] for text in indecisive] == ["checkpoint_seconds=20.0"]
 
     def checkpoint(*overrides):

@@ -11,7 +11,7 @@ import pytest
 
 import speed
 from command_line import psfdae
-from measure import cost_of_command, isolated
+from measure import isolate, measure_command
 from prediction import make_cube
 from psfdae.base.files import (
     Column,
@@ -115,14 +115,12 @@ def memory(cheap, tmp_path_factory):
     for count in (4000, 20_000):
         tree["stars"] = {**tree["stars"], "count": count}
         costs = {
-            "simulate": isolated(
-                1, cost_of_command, ["stars", "--templates", cheap[1]], stars, tree
-            )
+            "simulate": isolate(1, measure_command, ["stars", "--templates", cheap[1]], stars, tree)
         }
-        speed.untrained_bundle(tree, stars, bundle)
+        speed.write_untrained_bundle(tree, stars, bundle)
         make_cube(tree, stars, count, cube)
         words = ["predict", cube, "--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
-        costs["predict"] = isolated(1, cost_of_command, words, folder / "psf.fits")
+        costs["predict"] = isolate(1, measure_command, words, folder / "psf.fits")
         for job, cost in costs.items():
             peak_memory[job].append((cost["peak_b"] - cost["resting_b"]) / 2**20)
     return peak_memory

@@ -24,6 +24,7 @@ from psfdae.methods.field.spline import (
     FieldModel,
     adjust_stars,
     compute_spacing,
+    draw_splines,
     field_terms,
     image_design,
 )
@@ -112,9 +113,10 @@ def left_out_stars(
         splines = np.tensordot(terms[rows], fold_coefficients, 1)
         # Flux, centre and sky of the stars for these splines; all pixels have the same weight.
         start, steps = fit.centre[rows], settings.left_out_steps
-        flux, centre, residual = adjust_stars(
+        flux, centre, sky = adjust_stars(
             splines, images, is_valid, start, axis, spacing, steps, sky=True
         )
+        predicted_images = draw_splines(splines, axis, centre, spacing)
         # The sky b of weighted least squares with the design D of flux, row, column and sky is
         # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error contains the noise of the pixels and the error of
         # the median around the star, which was subtracted from them.
@@ -127,7 +129,7 @@ def left_out_stars(
         yield LeftOut(
             coefficients=fold_coefficients,
             light=len(axis) ** 2 / flux * [level, np.sqrt(variance)],
-            residual=residual,
+            residual=(images - sky[:, None, None]) / flux[:, None, None] - predicted_images,
             weight=is_valid * np.maximum(star_images[box][rows], 0.0),
         )
         judged_stars += len(rows)

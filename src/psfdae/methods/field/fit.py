@@ -285,6 +285,9 @@ class FieldFitter:
         light = np.median(self.images / flux[:, None, None], axis=0)
         robust_weight, pixel_weight = np.ones(self.images.shape), self.pixel_weight(flux, light)
         coefficients: np.ndarray | None = None
+        # Sums of the B-splines over the pixels of a stamp along an axis, of a star in its middle.
+        stamp_axis = np.arange(self.stamp_px) - self.stamp_px // 2.0
+        middle = cubic_splines(stamp_axis, options.knots, spacing).sum(axis=0)
         # Centres and weights of the last round are still to come: the others need less accuracy.
         early = replace(options, tolerance=max(options.tolerance, settings.early_tolerance))
         for turn in range(settings.rounds):
@@ -307,17 +310,15 @@ class FieldFitter:
             )
             # The mean star in the middle of its stamp has the sum 1: a common factor is moved from
             # the splines to the fluxes.
-            mean_splines = np.tensordot(terms.mean(axis=0)[None], coefficients, 1)
-            stamp_axis = np.arange(self.stamp_px) - self.stamp_px // 2.0
-            total = float(draw_splines(mean_splines, stamp_axis, np.zeros((1, 2)), spacing).sum())
+            term_light = middle @ coefficients @ middle
+            total = float(terms.mean(axis=0) @ term_light)
             coefficients, flux = coefficients / total, flux * factor * total
-            splines = np.tensordot(terms, coefficients, 1)
+            splines = splines / total
             star_images = draw_splines(splines, self.axis, centre, spacing)
             # Each star has the sum 1 in the middle of its stamp, and the same light at every phase:
             # otherwise fluxes and splines could compensate each other (eq. 1a).
-            centred_images = draw_splines(splines, stamp_axis, np.zeros((1, 2)), spacing)
             relative_light = compute_relative_light(splines, np.zeros(1), centre, spacing)
-            relative_light *= centred_images.sum(axis=(1, 2), keepdims=True)
+            relative_light *= (terms @ term_light / total)[:, None, None]
             flux, star_images = flux * relative_light[:, 0, 0], star_images / relative_light
             residual = np.where(self.is_valid, self.images / flux[:, None, None] - star_images, 0.0)
             # Outliers: pixels get less weight (Cauchy's weight 1/(1 + r² w/3²)), stars with a large

@@ -100,9 +100,7 @@ def residual_covariance(
     noise_variance = 0.5 * float(weight @ noise**2) * max(side**2 / len(residual), 1.0)
     # Matrices that shift the star from its centre to each phase, along rows and columns.
     shifts = list_phases(step_px)[:, None, None] - centre
-    rows, columns = (
-        np.array([moving_matrices(side, row) for row in shifts[..., axis]]) for axis in (0, 1)
-    )
+    rows, columns = (moving_matrices(side, shifts[..., axis]) for axis in (0, 1))
     columns = columns.transpose(0, 1, 3, 2)
     covariances = []
     for row in steps("residuals", rows):
@@ -112,8 +110,8 @@ def residual_covariance(
             # Principal components of the residuals, and their variances minus the noise.
             mean = weight @ flat_residuals
             scatter = np.sqrt(weight)[:, None] * (flat_residuals - mean)
-            _, size, axes = np.linalg.svd(scatter, full_matrices=False)
-            modes = np.sqrt(np.maximum(size**2 - noise_variance, 0.0))[:, None] * axes
+            square, axes = find_components(scatter)
+            modes = np.sqrt(np.maximum(square - noise_variance, 0.0))[:, None] * axes
             # The leading components are modes. The diagonal has a fraction of their variance and
             # all other components, because modes of few stars are not the directions of all stars.
             variance = np.square(modes).sum(axis=0)
@@ -124,3 +122,25 @@ def residual_covariance(
     offset, all_modes, diagonals = (np.stack(arrays) for arrays in zip(*covariances, strict=True))
     # An error of 1e-6 of the flux in any pixel keeps C invertible.
     return offset, all_modes, np.maximum(diagonals, 1e-6**2)
+
+
+def find_components(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the principal components of rows (n, P) about 0, the largest first.
+
+    Returns
+    -------
+    square : ndarray, shape (m,)
+        Sums of squares of the rows along the components, m = min(n, P).
+    axes : ndarray, shape (m, P)
+        The components, orthonormal, but those without a sum are 0.
+    """
+    # Eigenvectors of the smaller one of RᵀR and RRᵀ, in a third of the time of singular values.
+    count, pixels = rows.shape
+    if count >= pixels:
+        square, axes = np.linalg.eigh(rows.T @ rows)
+        return square[::-1], axes[:, ::-1].T
+    square, weights = np.linalg.eigh(rows @ rows.T)
+    square = np.maximum(square[::-1], 0.0)
+    size = np.sqrt(square)[:, None]
+    axes = np.divide(weights[:, ::-1].T @ rows, size, out=np.zeros_like(rows), where=size > 0)
+    return square, axes

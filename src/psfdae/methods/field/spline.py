@@ -286,8 +286,8 @@ def adjust_stars(
         Flux in the unit of the images.
     centre : ndarray, shape (n, 2)
         Centres (row, column) in pixels.
-    residual : ndarray, shape (n, s, s)
-        Image minus model, in units of the flux.
+    level : ndarray, shape (n,)
+        Sky in the unit of the images; 0 unless it is fitted.
     """
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
@@ -300,10 +300,7 @@ def adjust_stars(
         flux = parameters[:, 0]
         move = np.clip(parameters[:, 1:3] / flux[:, None], -0.3, 0.3)
         centre = np.clip(centre + move, -1.5, 1.5)
-    # Residuals of stars of flux 1 at their last centres.
-    level = parameters[:, 3, None, None] if sky else 0.0
-    star_images = draw_splines(splines, axis, centre, spacing)
-    return flux, centre, (data - level) / flux[:, None, None] - star_images
+    return flux, centre, parameters[:, 3] if sky else np.zeros(count)
 
 
 def image_design(
