@@ -324,7 +324,7 @@ def fit_half_widths(
 ) -> tuple[ErrorModel, StarErrors]:
     """Return the errors of a model with half-widths and limits of outliers, and the stars' errors.
 
-    Flux and sky of the stars are known.
+    Flux and sky of the stars are known. All factors of the half-widths are 1 (`fit_case_scales`).
     """
     errors = model.bundle.errors
     rng = stream(seed, "noise", "calibration", "errors")
@@ -335,6 +335,8 @@ def fit_half_widths(
         errors,
         half_width68=star_errors.half_width68,
         ratio95=star_errors.ratio95(),
+        scale68=np.ones_like(errors.scale68),
+        scale95=np.ones_like(errors.scale95),
         distance_limit=star_errors.distance_limit(),
         outlier_limit=star_errors.outlier_limit(),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,6 +25,7 @@ from psfdae.stars.noise import NoiseModel
 from psfdae.training.calibration import (
     StarErrors,
     fit_case_scales,
+    fit_half_widths,
     fit_model_errors,
     fit_noise_floor,
 )
@@ -94,6 +96,22 @@ def test_each_case_of_the_calibration_has_images_of_most_stars(order):
     with pytest.raises(Seen):
         fit_case_scales(model, stars, 1)
     assert min(seen.values()) >= 12
+
+
+def test_half_widths_that_are_calibrated_anew_have_no_factors_of_before(monkeypatch):
+    """Factors are of the half-widths that they were found with."""
+    nodes, widths = np.array([1e-3, 2e-3]), np.ones((2, 16, 16))
+    errors = ErrorModel.build_uncalibrated(nodes, widths)
+    before = replace(errors, scale68=2 * errors.scale68, scale95=3 * errors.scale95)
+    model = SimpleNamespace(
+        bundle=SimpleNamespace(errors=before, flux_model=None),
+        method=None,
+        info=SimpleNamespace(components=1),
+    )
+    found = StarErrors(nodes, np.ones((2, 5, 16, 16)), np.arange(5), np.ones((2, 5)))
+    monkeypatch.setattr(StarErrors, "measure", lambda *arguments: found)
+    after, _ = fit_half_widths(model, None, 1)
+    assert (after.scale68 == 1).all() and (after.scale95 == 1).all()
 
 
 def moffat(side, x, y, ux, uy):
