@@ -14,15 +14,12 @@ import sys
 from time import process_time
 
 import numpy as np
+from starts import NoisyStars
 
 from psfdae.base.threads import limit_threads
 from psfdae.sensing.climbing import compute_deviance_limit
-from psfdae.training.star_sets import noise_model
-from psfdae_paper.bounds.estimates import build_stamp_model
-from psfdae_paper.bounds.posterior_network import FreshStars, WavefrontCoordinates
-from psfdae_paper.bounds.refinement import NetworkStarts, Refiner, SeidelPrior
-from psfdae_paper.configuration.compose import load, part
-from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.bounds.posterior_network import WavefrontCoordinates
+from psfdae_paper.bounds.refinement import NetworkStarts, Refiner
 
 STARS, LEVELS, MEDIAN_ERROR = 400, {"dataset3": 1e-3, "dataset5": 7e-4}, 0.15
 WEIGHTS = (0.55, 0.25, 0.12, 0.08)
@@ -35,24 +32,17 @@ def main():
     writer = csv.writer(sys.stdout)
     writer.writerow(names)
     for dataset, value in LEVELS.items():
-        config = load([f"dataset={dataset}"])
-        simulation, noise = part(SIMULATION, config.model_dump()), noise_model(config)
-        model = build_stamp_model(simulation)
-        prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
-        side = model.framing.stamp_px
-        refiner = Refiner(prior, model.telescope.obscuration, side, noise)
-        fields, rng = np.ones(len(model.field), bool), np.random.default_rng(0)
-        stars = FreshStars.simulate(simulation, "search", STARS, fields).draw(STARS, rng)
-        level = np.full(STARS, value)
-        noisy = noise.draw(stars.stamps.reshape(-1, side, side), level, rng)
-        counts = np.rint(noise.flux(value) * noisy.reshape(STARS, -1)) + noise.background
-        truth = WavefrontCoordinates.decode(stars.wavefront, prior.pixel)
+        refiner, stamps, noisy, level, truth, rng = NoisyStars.simulate(
+            dataset, value, "search", STARS
+        )
+        flux, noise = refiner.noise.flux(value), refiner.noise
+        counts = np.rint(flux * noisy.reshape(STARS, -1)) + noise.background
         # Proposals with known scatter; without a network's PSF.
         sd = MEDIAN_ERROR * np.exp(0.7 * rng.standard_normal((STARS, 1, 1)))
         points = truth[:, None] + sd * rng.standard_normal((STARS, len(WEIGHTS), 8))
         root = WavefrontCoordinates.to_coordinates
         precision = np.tile(root.T @ root, (len(WEIGHTS), 1, 1)) / sd[..., None] ** 2
-        psf = stars.stamps, np.ones_like(stars.stamps)
+        psf = stamps, np.ones_like(stamps)
         proposals = NetworkStarts(points, precision, np.tile(WEIGHTS, (STARS, 1)), *psf)
         only = np.zeros((STARS, 1, 8, 8)), np.ones((STARS, 1))
         from_truth = NetworkStarts(truth[:, None], *only, *psf)
@@ -66,12 +56,12 @@ def main():
             Refiner.misfit_sigma, start = limit, process_time()
             refined = refiner.refine(noisy, level, starts)
             seconds = process_time() - start
-            error = np.square(refined.psf - stars.stamps).mean(axis=1)
-            mean_counts = noise.flux(value) * refined.psf + noise.background
+            error = np.square(refined.psf - stamps).mean(axis=1)
+            mean_counts = flux * refined.psf + noise.background
             chi2 = (np.square(counts - mean_counts) / mean_counts).sum(axis=1)
             values = error.mean(), np.median(error)
-            unexplained = np.mean(chi2 > compute_deviance_limit(side**2))
-            row = dataset, value, name, *(f"{v:.3g}" for v in values), f"{unexplained:.4f}"
+            misfits = np.mean(chi2 > compute_deviance_limit(counts.shape[1]))
+            row = dataset, value, name, *(f"{v:.3g}" for v in values), f"{misfits:.4f}"
             writer.writerow([*row, f"{1e3 * seconds / STARS:.2f}"])
 
 

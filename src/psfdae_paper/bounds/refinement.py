@@ -495,9 +495,9 @@ class Refiner:
         mean_counts = flux[:, None] * psf + self.noise.background
         chi2 = (np.square(counts - mean_counts) / np.maximum(mean_counts, 1.0)).sum(axis=1)
         limit = compute_deviance_limit(pixels, self.misfit_sigma)
-        unexplained = np.flatnonzero(chi2 > limit)
-        for first in range(0, len(unexplained), self.batch // 8):
-            stars = unexplained[first : first + self.batch // 8]
+        misfits = np.flatnonzero(chi2 > limit)
+        for first in range(0, len(misfits), self.batch // 8):
+            stars = misfits[first : first + self.batch // 8]
             points, damping = starts.scatter(stars, self.draws)
             star = np.repeat(stars, len(points) // len(stars))
             start = points, self.damping * damping

@@ -136,3 +136,7 @@ def test_methods_whose_bound_is_not_tight_have_open_markers(record_table, tight,
     figure = apply_style(figures.costs)(table)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels.count("over an upper limit of it") == expected
+    # Its markers in the panel of the stars, one for each dataset, and no others.
+    panels = figure.axes[1::2]
+    is_open = [line.get_mfc() == "white" for axes in panels for line in axes.lines]
+    assert sum(is_open) == expected * len(panels)
