@@ -89,8 +89,8 @@ def provenance(*names: str) -> dict[str, object]:
 def recorded(path: Path) -> str:
     """Return date and commit of a file that is not of the run of record, or an empty text."""
     if path.is_relative_to(RECORD):
-        kept: Mapping[str, Mapping[str, str]] = provenance().get("kept", {})  # type: ignore[assignment]
-        row = kept.get(path.relative_to(RECORD).as_posix())
+        other_runs: Mapping[str, Mapping[str, str]] = provenance().get("other_runs", {})  # type: ignore[assignment]
+        row = other_runs.get(path.relative_to(RECORD).as_posix())
     else:
         study = pd.read_csv(path).iloc[0] if path.suffix == ".csv" else {}
         row = study if "commit" in study else None

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import tarfile
+from datetime import date
 
 import pandas as pd
 import pytest
@@ -100,7 +101,7 @@ def test_record_holds_the_run_its_commit_and_its_costs(results, history, tmp_pat
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert files == {"tables/t.csv", "runtime.csv", "provenance.json"}
     provenance = recorded(out)
-    assert (provenance["commit"], provenance["kept"]) == (commit, {})
+    assert (provenance["commit"], provenance["other_runs"]) == (commit, {})
     assert provenance["peak_mb"] == 812.5
     assert provenance["cpu_s"] == pytest.approx(133.4)
     assert provenance["on_request_s"] == {"stability": 100.0}
@@ -118,15 +119,35 @@ def test_record_keeps_tables_that_take_long_with_their_commit(results, history, 
     out, first = tmp_path / "reference", history()
     written(results / SLOW, "b\n2\n")
     record.reference(results, out, [plan(results, **{SLOW: "no update"})])
-    assert recorded(out)["kept"] == {}
+    assert recorded(out)["other_runs"] == {}
     day = recorded(out)["date"]
     written(results / SLOW, "b\n3\n")
     for pending in ({SLOW: "update pending"}, {}):
         commit = history()
         record.reference(results, out, [plan(results, **pending)])
         assert (out / SLOW).read_text() == "b\n2\n"
-        assert recorded(out)["kept"] == {SLOW: {"commit": first, "date": day}}
+        assert recorded(out)["other_runs"] == {SLOW: {"commit": first, "date": day}}
         assert recorded(out)["commit"] == commit != first
+
+
+def test_a_later_run_completes_the_record_of_its_commit(results, history, tmp_path):
+    """Files of the record stay with its costs; the new table has the day of its own run."""
+    out, later = tmp_path / "reference", tmp_path / "later/results"
+    commit = history()
+    record.reference(results, out, [plan(results, **{"tables/t.csv": "no update"})])
+    before = recorded(out)
+    written(later / SLOW, "b\n2\n")
+    pending = {"runtime.csv": "update pending", "tables/t.csv": "update pending"}
+    record.reference(later, out, [plan(later, **pending, **{SLOW: "no update"})])
+    assert (out / SLOW).read_text() == "b\n2\n"
+    assert (out / "tables/t.csv").read_text() == "a\n1\n"
+    new_run = {"commit": commit, "date": date.today().isoformat()}
+    assert recorded(out) == before | {"other_runs": {SLOW: new_run}}
+    # A record of another commit cannot be completed, and stays as it is.
+    history()
+    with pytest.raises(ProductError, match=r"runtime\.csv: missing or out of date"):
+        record.reference(later, out, [plan(later, **pending, **{SLOW: "no update"})])
+    assert recorded(out)["commit"] == commit
 
 
 @pytest.mark.parametrize(
@@ -149,7 +170,7 @@ def test_record_of_another_code_is_refused(results, history, tmp_path, file, sta
 
 def test_record_is_of_commits_in_the_history():
     record = recorded(REFERENCE)
-    commits = {record["commit"], *(of["commit"] for of in record["kept"].values())}
+    commits = {record["commit"], *(of["commit"] for of in record["other_runs"].values())}
     commits |= {*pd.read_csv(ROOT / "studies/real_sky/table.csv").commit}
     if (
         source.git_commit() == "unknown"

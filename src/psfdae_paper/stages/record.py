@@ -93,16 +93,17 @@ def _last_run(benchmark: Path) -> pd.Series[float]:
 def reference(
     results: Folder, out: Folder, plans: Annotated[tuple[File, ...], {"flag": "--plan"}]
 ) -> None:
-    """Replace the committed run of record by a finished run.
+    """Replace the committed run of record by a finished run, or complete it.
 
     The new record belongs to the commit that is checked out. Code, workflow and settings must not
     differ from it, and Snakemake must find every file up to date with them, on whatever machine it
     was computed. Files that take long (`MAY_STAY`) and are not up to date stay from the earlier
-    record; provenance names them with the date and the commit of the earlier record, which must be
-    in the history.
+    record. A run without runtime.csv completes a record of the same commit: its files are added,
+    and all others stay.
 
     The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
-    from these files alone.
+    from these files alone. Provenance describes the run of runtime.csv; its entry `other_runs` has
+    date and commit of each file of another run. These commits must be in the history.
 
     Parameters
     ----------
@@ -115,28 +116,36 @@ def reference(
     """
     # Nothing may differ from the commit, and all files must be up to date with it.
     commit = clean_commit()
-    new_names = list_current_files(results, plans)
-    # Files of the earlier record that stay, with its commit and date.
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
-    names = (path.relative_to(out).as_posix() for path in sorted(out.rglob("*")) if path.is_file())
-    earlier_record = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
-    old_records: dict[str, dict[str, str]] = {
-        name: earlier.get("kept", {}).get(name) or earlier_record
-        for name in names
-        if name not in new_names and MAY_STAY.fullmatch(name)
-    }
+    is_completed = earlier.get("commit") == commit and not (results / "runtime.csv").is_file()
+    may_stay = re.compile(".+") if is_completed else MAY_STAY
+    new_names = list_current_files(results, plans, may_stay)
+    # Files of the earlier record that stay; those of a run of its own keep its date and commit.
+    files = (path for path in sorted(out.rglob("*")) if path.is_file() and path != provenance_path)
+    names = (path.relative_to(out).as_posix() for path in files)
+    old_names = [name for name in names if name not in new_names and may_stay.fullmatch(name)]
+    other_runs = {name: earlier.get("other_runs", {}).get(name) for name in old_names}
+    if is_completed:
+        record = earlier
+        today = {"commit": commit, "date": date.today().isoformat()}
+        other_runs = {name: run for name, run in other_runs.items() if run}
+        other_runs |= dict.fromkeys(new_names, today)
+    else:
+        record = provenance(results, load()) | {"commit": commit}
+        earlier_run = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
+        other_runs = {name: run or earlier_run for name, run in other_runs.items()}
     # A commit that is in the history can be checked out again.
-    for name, record in old_records.items():
+    for name, run in other_runs.items():
         try:
-            git("merge-base", "--is-ancestor", record["commit"], "HEAD")
+            git("merge-base", "--is-ancestor", run["commit"], "HEAD")
         except subprocess.CalledProcessError:
             raise ProductError(
-                f"{name}: recorded at commit {record['commit']:.12}, which is not in the history;"
+                f"{name}: recorded at commit {run['commit']:.12}, which is not in the history;"
                 " compute it again, or remove it from the record"
             ) from None
     sources = {name: results / name for name in new_names}
-    sources |= {name: out / name for name in old_records}
+    sources |= {name: out / name for name in old_names}
     # The new record is complete before it replaces the earlier one.
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
@@ -145,8 +154,7 @@ def reference(
         target.parent.mkdir(parents=True, exist_ok=True)
         # Contents only: dates of the files are not part of the record.
         shutil.copyfile(path, target)
-    new_record = provenance(results, load()) | {"commit": commit, "kept": old_records}
-    text = json.dumps(new_record, indent=2, sort_keys=True)
+    text = json.dumps(record | {"other_runs": other_runs}, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
@@ -174,7 +182,9 @@ def clean_commit() -> str:
     return commit
 
 
-def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
+def list_current_files(
+    results: Path, plans: Iterable[Path], may_stay: re.Pattern[str]
+) -> list[str]:
     """Return the files of the record that Snakemake finds up to date.
 
     Parameters
@@ -183,6 +193,8 @@ def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
         Folder of the run.
     plans : iterable of Path
         Outputs of `snakemake --summary`.
+    may_stay : Pattern
+        Names of files that need not be up to date.
 
     Returns
     -------
@@ -213,7 +225,7 @@ def list_current_files(results: Path, plans: Iterable[Path]) -> list[str]:
     )
     entries = {name: plan for name, plan in plan_by_name.items() if record_names.fullmatch(name)}
     outdated_names = {name for name, plan in entries.items() if plan != "no update"}
-    required_names = sorted(name for name in outdated_names if not MAY_STAY.fullmatch(name))
+    required_names = sorted(name for name in outdated_names if not may_stay.fullmatch(name))
     if required_names:
         raise ProductError(
             f"{results / required_names[0]}: missing or out of date (in all {len(required_names)}"
