@@ -19,7 +19,7 @@ from psfdae.base.threads import limit_threads
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.bounds.estimates import build_stamp_model
 from psfdae_paper.bounds.posterior_network import FreshStars, WavefrontCoordinates
-from psfdae_paper.bounds.refinement import NetworkStarts, Refiner, SeidelPrior
+from psfdae_paper.bounds.refinement import NetworkStarts, Refiner
 from psfdae_paper.configuration.compose import load, part
 from psfdae_paper.configuration.consistency import SIMULATION
 
@@ -45,14 +45,12 @@ class NoisyStars(NamedTuple):
         config = load([f"dataset={dataset}"])
         simulation, noise = part(SIMULATION, config.model_dump()), noise_model(config)
         model = build_stamp_model(simulation)
-        prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
-        side = model.framing.stamp_px
-        refiner = Refiner(prior, model.telescope.obscuration, side, noise)
+        side, refiner = model.framing.stamp_px, Refiner.from_model(model, noise, config.seed)
         fields, rng = np.ones(len(model.field), bool), np.random.default_rng(0)
         stars = FreshStars.simulate(simulation, name, count, fields).draw(count, rng)
         level = np.full(count, value)
         noisy = noise.draw(stars.stamps.reshape(-1, side, side), level, rng)
-        truth = WavefrontCoordinates.decode(stars.wavefront, prior.pixel)
+        truth = WavefrontCoordinates.decode(stars.wavefront, refiner.prior.pixel)
         return cls(refiner, stars.stamps, noisy, level, truth, rng)
 
 

@@ -25,10 +25,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from psfdae.base.rng import stream
 from psfdae.base.rows import Rows
 from psfdae.optics.derivatives import ImageSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.pupil import annular_pupil, choose_samples
@@ -46,6 +47,7 @@ from psfdae_paper.bounds.posterior_network import (
     WavefrontCoordinates,
     WavefrontNetwork,
 )
+from psfdae_paper.bounds.stamp_model import StampModel
 
 
 @dataclass(frozen=True)
@@ -238,6 +240,8 @@ class Expansion(Rows):
         Stamps of sum 1, and their derivatives by c.
     deviance : ndarray, shape (n,)
         −2 ln L(c⁰), relative to the counts themselves.
+    fields : ndarray of int, shape (n, f)
+        Fields of the components.
     components : Components
         Posterior of δ.
     """
@@ -246,7 +250,13 @@ class Expansion(Rows):
     stamps: np.ndarray
     slopes: np.ndarray
     deviance: np.ndarray
+    fields: np.ndarray
     components: Components
+
+    @property
+    def log_mass(self) -> np.ndarray:
+        """Logarithms of prior × likelihood, integrated over each component, (n, 4 f)."""
+        return np.asarray(self.components.log_mass - 0.5 * self.deviance[:, None])
 
     @property
     def evidence(self) -> np.ndarray:
@@ -304,10 +314,13 @@ class NetworkStarts(NamedTuple):
         points = WavefrontCoordinates.decode(wavefront, pixel)
         return cls(points, precision, np.exp(log_weight), psf, sigma**2)
 
-    def scatter(self, stars: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray]:
+    def scatter(
+        self, stars: np.ndarray, draws: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return all K wavefronts of stars (n,), and draws around them, star after star.
 
-        A draw is limited to errors of the coefficients of half a wave.
+        A draw is limited to errors of the coefficients of half a wave. All stars have the same
+        normal deviates, so that the draws of a star do not depend on the others.
 
         Returns
         -------
@@ -318,10 +331,9 @@ class NetworkStarts(NamedTuple):
         """
         points, precision = self.points[stars, :, None], self.precision[stars, :, None]
         size = points.shape[-1]
-        # μ + L⁻ᵀ u with the precision L Lᵀ; the same normal u for all stars, which do not depend on
-        # each other in this way.
+        # μ + L⁻ᵀ u with the precision L Lᵀ.
         root = np.linalg.cholesky(precision + 4.0 * np.eye(size))
-        normal = np.random.default_rng(0).standard_normal((points.shape[1], draws, size, 1))
+        normal = rng.standard_normal((points.shape[1], draws, size, 1))
         drawn_points = points + np.linalg.solve(root.swapaxes(-1, -2), normal)[..., 0]
         all_points = np.concatenate([points, drawn_points], axis=2)
         all_precisions = np.broadcast_to(precision, (*all_points.shape, size))
@@ -360,6 +372,8 @@ class Refiner:
         Pixels d along a side.
     noise : NoiseModel
         Photon noise of the images.
+    seed : int
+        Seed of the draws.
     max_steps : int
         Maximum number of successive expansions, at least two.
     damping : float
@@ -393,6 +407,7 @@ class Refiner:
     obscuration: float
     stamp_px: int
     noise: NoiseModel
+    seed: int
     max_steps: ClassVar[int] = 4
     linear_waves: ClassVar[float] = 0.1
     min_far_mass: ClassVar[float] = 0.05
@@ -412,6 +427,12 @@ class Refiner:
         *(190, 222, 254, 318, 398, 478, 574, 690, 830, 1000),
     )
     """Pupil grids, of which a wavefront uses the smallest one with enough samples."""
+
+    @classmethod
+    def from_model(cls, model: StampModel, noise: NoiseModel, seed: int) -> Self:
+        """Return the optics of a dataset's stamps with photon noise."""
+        prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
+        return cls(prior, model.telescope.obscuration, model.framing.stamp_px, noise, seed)
 
     @cached_property
     def _operator(self) -> SampledStamps:
@@ -467,7 +488,7 @@ class Refiner:
         """Expand posteriors about wavefronts in the fields (n, f) of each; see `measure`."""
         stamps, slopes, (deviance, score, information) = self.measure(point, counts, flux)
         components = self.prior.condition(point, score, information, fields)
-        return Expansion(point, stamps, slopes, deviance, components)
+        return Expansion(point, stamps, slopes, deviance, fields, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
         """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
@@ -498,10 +519,13 @@ class Refiner:
         misfits = np.flatnonzero(chi2 > limit)
         for first in range(0, len(misfits), self.batch // 8):
             stars = misfits[first : first + self.batch // 8]
-            points, damping = starts.scatter(stars, self.draws)
+            rng = stream(self.seed, "posterior network", "search")
+            points, damping = starts.scatter(stars, self.draws, rng)
             star = np.repeat(stars, len(points) // len(stars))
             start = points, self.damping * damping
-            results.put(*self.climb(star, *start, counts, flux, steps=self.search_steps))
+            stars, search = self.climb(star, *start, counts, flux, steps=self.search_steps)
+            is_better = search.evidence > results.evidence[stars]
+            results.put(stars[is_better], search.select(is_better))
         return results
 
     def climb(
@@ -541,7 +565,15 @@ class Refiner:
             star, point, damping, fields = (
                 array[is_used] for array in (star, point, damping, fields)
             )
-        star, expansion = self.follow(star, point, fields, counts, flux)
+        return self.average(*self.follow(star, point, fields, counts, flux), counts, flux)
+
+    def average(
+        self, star: np.ndarray, expansion: Expansion, counts: np.ndarray, flux: np.ndarray
+    ) -> tuple[np.ndarray, RefinedPsfs]:
+        """Return the numbers (m,) of stars, and the posterior means of their expansions.
+
+        For the arguments see `follow`, whose results are averaged.
+        """
         # Means over the wavefronts of a star, with their posterior probabilities.
         stars, number = np.unique(star, return_inverse=True)
         evidence = np.full(len(stars), -np.inf)

@@ -36,8 +36,7 @@ def model():
 
 
 def build_refiner(model, fields=slice(None)):
-    prior = SeidelPrior(model.mean, model.sd, model.field[fields], model.telescope.pixel)
-    return Refiner(prior, model.telescope.obscuration, model.framing.stamp_px, NOISE)
+    return Refiner.from_model(replace(model, field=model.field[fields]), NOISE, seed=0)
 
 
 def propose(points, psf):
