@@ -382,11 +382,20 @@ def test_half_precision_rounds_all_layers_but_the_last(monkeypatch):
     network = build_dae([3, 1, 3], [4, 4], "he", torch.Generator().manual_seed(1))
     images = torch.rand(2, 1, 8, 8, generator=torch.Generator().manual_seed(2))
     expected = network(images)
-    # A processor without instructions for it computes as always.
-    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
-    with loop.use_half_precision():
-        assert torch.equal(network(images), expected)
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    # A processor without instructions for it computes as always, and so do those of Intel that
+    # have them in vector units alone.
+    intel = {"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": False}
+    for capabilities in ({}, intel):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda c=capabilities: c, raising=False)
+        with loop.use_half_precision():
+            assert torch.equal(network(images), expected)
+    for capabilities in (
+        {"cpu_name": "AMD Zen4 (EPYC)", "avx512_bf16": True},
+        {**intel, "amx_bf16": True},
+    ):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda c=capabilities: c, raising=False)
+        with loop.use_half_precision():
+            assert not torch.equal(network(images), expected)
     with loop.use_half_precision(False):
         assert torch.equal(network(images), expected)
     with loop.use_half_precision():
