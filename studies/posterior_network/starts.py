@@ -3,8 +3,7 @@
     python studies/posterior_network/starts.py > studies/posterior_network/starts.csv
 
 Starts are the true wavefronts of stars of the prior, with normal errors of the same standard
-deviation in all eight coefficients. A star has one start and no network, and no star is searched
-anew.
+deviation in all eight coefficients. A star has one start and no network.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class NoisyStars(NamedTuple):
         config = load([f"dataset={dataset}"])
         simulation, noise = part(SIMULATION, config.model_dump()), noise_model(config)
         model = build_stamp_model(simulation)
-        side, refiner = model.framing.stamp_px, Refiner.from_model(model, noise, config.seed)
+        side, refiner = model.framing.stamp_px, Refiner.from_model(model, noise)
         fields, rng = np.ones(len(model.field), bool), np.random.default_rng(0)
         stars = FreshStars.simulate(simulation, name, count, fields).draw(count, rng)
         level = np.full(count, value)
@@ -57,7 +56,7 @@ class NoisyStars(NamedTuple):
 def main():
     """Print a row for each dataset, number of expansions and distance."""
     limit_threads(1)
-    Refiner.misfit_sigma = np.inf
+    Refiner.positions = (0.0,)
     names = "dataset", "noise_level", "start_error_waves", "expansions", "mse", "median", "variance"
     writer = csv.writer(sys.stdout)
     writer.writerow(names)

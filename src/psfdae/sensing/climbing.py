@@ -83,24 +83,6 @@ class Peaks(Rows):
         return covariance, np.where(sign > 0, self.height + 0.5 * log_determinant, -np.inf)
 
 
-def poisson_deviance(counts: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviance (...,) of Poisson counts, and the relative excess of each pixel.
-
-    Parameters
-    ----------
-    counts : ndarray, shape (..., P)
-        Counts n of the pixels; NaN where a pixel is not used, whose excess is 0.
-    mean : ndarray, shape (..., P)
-        Expected counts μ, above 0.
-    """
-    # Relative excess e = n/μ − 1 of each pixel.
-    excess = np.where(np.isfinite(counts), counts / mean - 1.0, 0.0)
-    # Deviance 2 Σ (n ln(n/μ) − (n − μ)). The form μ ((1 + e) ln(1 + e) − e) of its terms avoids
-    # cancellation for small e; the limit keeps the logarithm of a pixel without counts finite.
-    log_ratio = np.log1p(np.maximum(excess, -1.0 + 1e-12))
-    return 2.0 * (mean * ((1.0 + excess) * log_ratio - excess)).sum(axis=-1), excess
-
-
 def poisson_information(counts: np.ndarray, mean: np.ndarray, slopes: np.ndarray) -> Evaluation:
     """Return deviance (n,), score (n, K) and Fisher information (n, K, K) of Poisson counts.
 
@@ -113,9 +95,15 @@ def poisson_information(counts: np.ndarray, mean: np.ndarray, slopes: np.ndarray
     slopes : ndarray, shape (n, K, P)
         Derivatives of μ with respect to the parameters.
     """
-    deviance, excess = poisson_deviance(counts, mean)
+    # Relative excess e = n/μ − 1 of each pixel.
+    is_used = np.isfinite(counts)
+    excess = np.where(is_used, counts / mean - 1.0, 0.0)
+    # Deviance 2 Σ (n ln(n/μ) − (n − μ)). The form μ ((1 + e) ln(1 + e) − e) of its terms avoids
+    # cancellation for small e; the limit keeps the logarithm of a pixel without counts finite.
+    log_ratio = np.log1p(np.maximum(excess, -1.0 + 1e-12))
+    deviance = 2.0 * (mean * ((1.0 + excess) * log_ratio - excess)).sum(axis=-1)
     # Score Σ e ∂μ, and information Σ ∂μ ∂μᵀ / μ.
-    weighted_slopes = slopes * np.where(np.isfinite(counts), 1.0 / mean, 0.0)[:, None]
+    weighted_slopes = slopes * np.where(is_used, 1.0 / mean, 0.0)[:, None]
     score = (slopes @ excess[:, :, None])[:, :, 0]
     return deviance, score, weighted_slopes @ slopes.swapaxes(1, 2)
 

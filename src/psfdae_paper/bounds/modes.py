@@ -100,16 +100,21 @@ class Modes(Rows):
         return np.asarray((offset**2).sum(axis=1))
 
     def log_density(self, draws: Positions, squared_distance: np.ndarray) -> np.ndarray:
-        """Return the log-density of Student's t around every mode at draws, (M, n)."""
+        """Return the log-density of Student's t around every mode at draws, (M, n).
+
+        With ν degrees of freedom in D dimensions, ln p = ln Γ((ν + D)/2) − ln Γ(ν/2)
+        − (D/2) ln(νπ) − ln |L| − (ν + D)/2 ln(1 + distance²/ν).
+        """
+        terms = self.z.shape[1]
         # ln |L| of a triangular matrix is the sum over its diagonal.
         log_determinant = np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(axis=1)
-        log_density = log_student_density(
-            squared_distance, log_determinant[:, None], self.z.shape[1], self.freedom
-        )
+        constant = lgamma(0.5 * (self.freedom + terms)) - lgamma(0.5 * self.freedom)
+        constant -= 0.5 * terms * np.log(self.freedom * np.pi)
+        tail = 0.5 * (self.freedom + terms) * np.log1p(squared_distance / self.freedom)
         # Fields and offsets are discrete: a mode proposes draws at its own field and offset only.
         is_own = self.field[:, None] == draws.field
         is_own &= (self.offset[:, None] == draws.offset).all(axis=2)
-        return np.where(is_own, log_density, -np.inf)
+        return np.where(is_own, constant - log_determinant[:, None] - tail, -np.inf)
 
     def adapt(self, draws: Positions, log_weight: np.ndarray) -> Modes:
         """Adapt positions, scales and masses to the weights (n,) of all draws of the star.
@@ -185,30 +190,6 @@ class Modes(Rows):
         stretch = np.sqrt(self.freedom / rng.chisquare(self.freedom, mode.size))
         z = self.z[mode] + (self.factor[mode] @ (normal * stretch[:, None])[:, :, None])[:, :, 0]
         return Positions(self.field[mode], self.offset[mode], z), number
-
-
-def log_student_density(
-    squared_distance: np.ndarray, log_determinant: np.ndarray, terms: int, freedom: float
-) -> np.ndarray:
-    """Return the log-density of Student's t with ν degrees of freedom in D dimensions.
-
-    ln p = ln Γ((ν + D)/2) − ln Γ(ν/2) − (D/2) ln(νπ) − ln |L| − (ν + D)/2 ln(1 + distance²/ν).
-
-    Parameters
-    ----------
-    squared_distance : ndarray
-        (x − μ)ᵀ (LLᵀ)⁻¹ (x − μ).
-    log_determinant : ndarray
-        ln |L|.
-    terms : int
-        Number of dimensions D.
-    freedom : float
-        Degrees of freedom ν.
-    """
-    constant = lgamma(0.5 * (freedom + terms)) - lgamma(0.5 * freedom)
-    constant -= 0.5 * terms * np.log(freedom * np.pi)
-    tail = 0.5 * (freedom + terms) * np.log1p(squared_distance / freedom)
-    return np.asarray(constant - log_determinant - tail)
 
 
 def rank_in_group(group: np.ndarray, key: np.ndarray) -> np.ndarray:

@@ -22,21 +22,19 @@ its variance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.base.rng import stream
 from psfdae.base.rows import Rows
 from psfdae.optics.derivatives import ImageSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.pupil import annular_pupil, choose_samples
 from psfdae.optics.wavefronts import MONOMIALS, monomial_coefficients, monomial_images
 from psfdae.sensing.climbing import (
     Evaluation,
-    compute_deviance_limit,
     group_maximum,
     poisson_information,
 )
@@ -122,32 +120,38 @@ class SeidelPrior:
         limited_z = np.clip(z, -self.max_abs_z, self.max_abs_z)
         return Components(log_mass.reshape(len(point), -1), gap, limited_z, directions, covariance)
 
-    def find_fields(
-        self, point: np.ndarray, score: np.ndarray, information: np.ndarray, number: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the most likely fields among all; for the arguments see `condition`.
+    def select_fields(self, point: np.ndarray, number: int) -> np.ndarray:
+        """Select the fields in which wavefronts are most likely, without regard to their tilts.
+
+        Parameters
+        ----------
+        point : ndarray, shape (n, 8)
+            Coefficients.
+        number : int
+            Number of fields of each wavefront; all fields if there are fewer.
 
         Returns
         -------
-        evidence : ndarray, shape (n,)
-            Logarithm of the mass in all fields.
-        mode : ndarray, shape (n, 8)
-            Mean of δ in the component of the largest mass.
-        fields : ndarray of int, shape (n, number)
-            Fields with the largest masses, each by its best offset.
+        ndarray of int, shape (n, min(number, F))
         """
-        size = len(self.field)
-        number, every_field, parts = min(number, size), np.arange(size), []
-        # A few stars at a time, whose components stay in the cache of the processor.
-        for first in range(0, len(point), 32):
-            rows = slice(first, first + 32)
-            fields = np.broadcast_to(every_field, (len(point[rows]), size))
-            components = self.condition(point[rows], score[rows], information[rows], fields)
-            log_mass = components.log_mass.reshape(*fields.shape, 4).max(axis=2)
-            likely = np.argpartition(-log_mass, number - 1, axis=1)[:, :number]
-            parts.append((components.evidence, components.mode, likely))
-        evidence, mode, likely = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return evidence, mode, likely
+        root, offset, log_determinant = self._field_roots
+        terms, number = len(root), min(number, len(self.field))
+        # −2 ln density in each field is |R (c − s)|² + ln |covariance|.
+        deviation = np.square(point[:, :terms] @ root.reshape(terms, -1) - offset)
+        distance = deviation.reshape(len(point), -1, terms).sum(axis=2) + log_determinant
+        return np.asarray(np.argpartition(distance, number - 1, axis=1)[:, :number])
+
+    @cached_property
+    def _field_roots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Matrices Rᵀ (6, F, 6) of R (c − s), R s (6 F,), and ln |covariance| (F,)."""
+        # Wavefronts from which the fields are selected have errors of a tenth of a wave.
+        directions, static = self.directions[..., :-2], self.static[:, :-2]
+        terms = static.shape[1]
+        covariance = directions.swapaxes(1, 2) @ directions + 0.1**2 * np.eye(terms)
+        root = np.linalg.cholesky(np.linalg.inv(covariance))
+        offset = (static[:, None] @ root).ravel()
+        log_determinant = np.linalg.slogdet(covariance)[1]
+        return np.ascontiguousarray(root.swapaxes(0, 1)), offset, log_determinant
 
 
 @dataclass(frozen=True)
@@ -240,8 +244,6 @@ class Expansion(Rows):
         Stamps of sum 1, and their derivatives by c.
     deviance : ndarray, shape (n,)
         −2 ln L(c⁰), relative to the counts themselves.
-    fields : ndarray of int, shape (n, f)
-        Fields of the components.
     components : Components
         Posterior of δ.
     """
@@ -250,13 +252,7 @@ class Expansion(Rows):
     stamps: np.ndarray
     slopes: np.ndarray
     deviance: np.ndarray
-    fields: np.ndarray
     components: Components
-
-    @property
-    def log_mass(self) -> np.ndarray:
-        """Logarithms of prior × likelihood, integrated over each component, (n, 4 f)."""
-        return np.asarray(self.components.log_mass - 0.5 * self.deviance[:, None])
 
     @property
     def evidence(self) -> np.ndarray:
@@ -314,30 +310,44 @@ class NetworkStarts(NamedTuple):
         points = WavefrontCoordinates.decode(wavefront, pixel)
         return cls(points, precision, np.exp(log_weight), psf, sigma**2)
 
-    def scatter(
-        self, stars: np.ndarray, draws: int, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return all K wavefronts of stars (n,), and draws around them, star after star.
+    def spread(
+        self, proposals: int, min_weight: float, positions: Sequence[float], width: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return starts along the axis of each proposal on which its error is largest.
 
-        A draw is limited to errors of the coefficients of half a wave. All stars have the same
-        normal deviates, so that the draws of a star do not depend on the others.
+        Parameters
+        ----------
+        proposals : int
+            Number of proposals, the most likely ones.
+        min_weight : float
+            Minimum probability of a proposal, unless it is the most likely one.
+        positions : sequence of float
+            Positions of the starts on the axis in standard deviations of the proposal.
+        width : float
+            Standard deviation of a start along the axis over the standard deviation of the
+            proposal.
 
         Returns
         -------
-        points : ndarray, shape (n K (1 + draws), 8)
-            Coefficients.
-        precision : ndarray, shape (n K (1 + draws), 8, 8)
-            Inverse covariances of their errors.
+        star : ndarray of int, shape (m,)
+            Star of each start.
+        point, precision : ndarray, shapes (m, 8) and (m, 8, 8)
+            Coefficients, and inverse covariances of their errors.
         """
-        points, precision = self.points[stars, :, None], self.precision[stars, :, None]
-        size = points.shape[-1]
-        # μ + L⁻ᵀ u with the precision L Lᵀ.
-        root = np.linalg.cholesky(precision + 4.0 * np.eye(size))
-        normal = rng.standard_normal((points.shape[1], draws, size, 1))
-        drawn_points = points + np.linalg.solve(root.swapaxes(-1, -2), normal)[..., 0]
-        all_points = np.concatenate([points, drawn_points], axis=2)
-        all_precisions = np.broadcast_to(precision, (*all_points.shape, size))
-        return all_points.reshape(-1, size), all_precisions.reshape(-1, size, size)
+        is_used = self.weight[:, :proposals] > min_weight
+        is_used[:, :1] = True
+        star, number = np.nonzero(is_used)
+        point, precision = self.points[star, number], self.precision[star, number]
+        # The standard deviation along the axis is limited to two waves.
+        eigenvalues, axes = np.linalg.eigh(precision + 0.25 * np.eye(point.shape[1]))
+        sd, axis = eigenvalues[:, :1] ** -0.5, axes[:, :, 0]
+        # A start is as uncertain as its proposal, but along the axis.
+        narrow_axis = axis / (width * sd)
+        precision = precision + narrow_axis[:, :, None] * narrow_axis[:, None]
+        shift = np.multiply.outer(positions, sd * axis)
+        points = (point + shift).swapaxes(0, 1).reshape(-1, point.shape[1])
+        count = len(positions)
+        return np.repeat(star, count), points, np.repeat(precision, count, axis=0)
 
 
 @dataclass(frozen=True)
@@ -372,33 +382,31 @@ class Refiner:
         Pixels d along a side.
     noise : NoiseModel
         Photon noise of the images.
-    seed : int
-        Seed of the draws.
-    max_steps : int
-        Maximum number of successive expansions, at least two.
+    proposals : int
+        Maximum number of proposals from which a star's climbs start.
+    min_weight : float
+        Minimum probability of a proposal.
+    positions : tuple of float
+        Positions of the starts along the axis of a proposal, in standard deviations.
+    width : float
+        Standard deviation of a start along this axis over the standard deviation of the proposal.
     damping : float
         Factor of the inverse covariances of starts, by which the first step is damped.
+    max_wavefronts : int
+        Maximum number of starts that are refined.
+    max_gap : float
+        Difference in the logarithm of the evidence of first expansions, below which a start is
+        refined.
+    max_steps : int
+        Maximum number of successive expansions, at least two.
     linear_waves : float
         RMS of the difference of two wavefronts in waves, up to which an expansion about one of them
         is used at the other.
     min_far_mass : float
         Part of a star's mass that is farther from all expansion points, above which another
         expansion is made.
-    max_proposals : int
-        Maximum number of proposals that are tried.
-    min_weight : float
-        Total probability of the others, above which the next proposal is tried.
-    max_gap : float
-        Difference in the logarithm of the evidence of first expansions, below which a proposal is
-        refined.
-    misfit_sigma : float
-        Excess of χ² in standard deviations, above which a star is not explained by its wavefronts.
-    draws : int
-        Draws around each proposal of such a star.
-    search_steps : int
-        Damped steps from these draws.
     fields_kept : int
-        Fields that expansions after the first one consider, the most likely of the first.
+        Fields that an expansion considers, the most likely ones.
     batch : int
         Stars that are refined together.
     """
@@ -407,19 +415,18 @@ class Refiner:
     obscuration: float
     stamp_px: int
     noise: NoiseModel
-    seed: int
+    proposals: ClassVar[int] = 3
+    min_weight: ClassVar[float] = 0.02
+    positions: ClassVar[tuple[float, ...]] = (-1.5, 0.0, 1.5)
+    width: ClassVar[float] = 0.6
+    damping: ClassVar[float] = 0.25
+    max_wavefronts: ClassVar[int] = 4
+    max_gap: ClassVar[float] = 6.0
     max_steps: ClassVar[int] = 4
     linear_waves: ClassVar[float] = 0.1
     min_far_mass: ClassVar[float] = 0.05
-    damping: ClassVar[float] = 0.25
-    max_proposals: ClassVar[int] = 8
-    min_weight: ClassVar[float] = 0.05
-    max_gap: ClassVar[float] = 6.0
-    misfit_sigma: ClassVar[float] = 4.0
-    draws: ClassVar[int] = 2
-    search_steps: ClassVar[int] = 3
-    fields_kept: ClassVar[int] = 24
-    batch: ClassVar[int] = 128
+    fields_kept: ClassVar[int] = 32
+    batch: ClassVar[int] = 64
     sampling: ClassVar[float] = 0.85
     """Factor of the pupil samples that `SampledStamps` would choose."""
     pupil_samples: ClassVar[tuple[int, ...]] = (
@@ -429,10 +436,10 @@ class Refiner:
     """Pupil grids, of which a wavefront uses the smallest one with enough samples."""
 
     @classmethod
-    def from_model(cls, model: StampModel, noise: NoiseModel, seed: int) -> Self:
+    def from_model(cls, model: StampModel, noise: NoiseModel) -> Self:
         """Return the optics of a dataset's stamps with photon noise."""
         prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
-        return cls(prior, model.telescope.obscuration, model.framing.stamp_px, noise, seed)
+        return cls(prior, model.telescope.obscuration, model.framing.stamp_px, noise)
 
     @cached_property
     def _operator(self) -> SampledStamps:
@@ -482,20 +489,15 @@ class Refiner:
         likelihood = poisson_information(counts, mean_counts, flux[:, None, None] * slopes)
         return stamps, slopes, likelihood
 
-    def expand(
-        self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray, fields: np.ndarray
-    ) -> Expansion:
-        """Expand posteriors about wavefronts in the fields (n, f) of each; see `measure`."""
+    def expand(self, point: np.ndarray, counts: np.ndarray, flux: np.ndarray) -> Expansion:
+        """Expand posteriors about wavefronts, in the most likely fields; see `measure`."""
         stamps, slopes, (deviance, score, information) = self.measure(point, counts, flux)
+        fields = self.prior.select_fields(point, self.fields_kept)
         components = self.prior.condition(point, score, information, fields)
-        return Expansion(point, stamps, slopes, deviance, fields, components)
+        return Expansion(point, stamps, slopes, deviance, components)
 
     def refine(self, noisy: np.ndarray, level: np.ndarray, starts: NetworkStarts) -> RefinedPsfs:
-        """Return the posterior means of images (n, d, d) of levels (n,) about refined wavefronts.
-
-        Proposals are tried up to a total probability, and refined unless the first expansion of
-        another one has much more evidence. A star that no wavefront explains is searched anew.
-        """
+        """Return the posterior means of images (n, d, d) of levels (n,) about their wavefronts."""
         count, pixels = len(noisy), self.stamp_px**2
         flux = self.noise.flux(level)
         # Counts are whole numbers: rounding undoes the loss of the images' single precision.
@@ -503,41 +505,25 @@ class Refiner:
         counts = np.rint(flux[:, None] * images) + self.noise.background
         psf, variance = np.zeros((2, count, pixels))
         results = RefinedPsfs(psf, variance, np.full(count, -np.inf))
-        # Proposals that are preceded by less than the total probability.
-        is_likely = np.cumsum(starts.weight, axis=1) - starts.weight < 1.0 - self.min_weight
-        is_likely[:, self.max_proposals :] = False
+        # Nearly the same images have wavefronts along an axis, between which no step leads.
+        spread = self.proposals, self.min_weight, self.positions, self.width
         for first in range(0, count, self.batch):
-            star, number = np.nonzero(is_likely[first : first + self.batch])
-            star += first
-            start = starts.points[star, number], self.damping * starts.precision[star, number]
-            results.put(*self.climb(star, *start, counts, flux, steps=1))
-        # χ² of stars that none of their wavefronts explains is too large. They are searched in
-        # several steps, from all proposals and from draws of their Gaussians.
-        mean_counts = flux[:, None] * psf + self.noise.background
-        chi2 = (np.square(counts - mean_counts) / np.maximum(mean_counts, 1.0)).sum(axis=1)
-        limit = compute_deviance_limit(pixels, self.misfit_sigma)
-        misfits = np.flatnonzero(chi2 > limit)
-        for first in range(0, len(misfits), self.batch // 8):
-            stars = misfits[first : first + self.batch // 8]
-            rng = stream(self.seed, "posterior network", "search")
-            points, damping = starts.scatter(stars, self.draws, rng)
-            star = np.repeat(stars, len(points) // len(stars))
-            start = points, self.damping * damping
-            stars, search = self.climb(star, *start, counts, flux, steps=self.search_steps)
-            is_better = search.evidence > results.evidence[stars]
-            results.put(stars[is_better], search.select(is_better))
+            part = NetworkStarts(*(column[first : first + self.batch] for column in starts))
+            star, point, precision = part.spread(*spread)
+            star, point = self.begin(star + first, point, self.damping * precision, counts, flux)
+            star, expansion = self.follow(star, point, counts, flux)
+            results.put(*self.average(star, expansion))
         return results
 
-    def climb(
+    def begin(
         self,
         star: np.ndarray,
         point: np.ndarray,
         damping: np.ndarray,
         counts: np.ndarray,
         flux: np.ndarray,
-        steps: int,
-    ) -> tuple[np.ndarray, RefinedPsfs]:
-        """Return the numbers (m,) of stars, and their posterior means from starts.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Make a first, damped step from each start, and select the wavefronts to refine.
 
         Parameters
         ----------
@@ -547,40 +533,36 @@ class Refiner:
             Coefficients, and inverse covariances that limit a step.
         counts, flux : ndarray, shapes (N, P) and (N,)
             Photons of all stars; see `measure`.
-        steps : int
-            Damped steps, after each of which the most likely wavefronts are kept.
-        """
-        for step in range(steps):
-            evidence, point, fields = self.begin(point, damping, counts[star], flux[star])
-            # Near the best wavefront of a star no other one is needed, nor with much less evidence.
-            order = np.lexsort((-evidence, star))
-            star, evidence, point, damping, fields = (
-                array[order] for array in (star, evidence, point, damping, fields)
-            )
-            is_used = self.find_distinct(star, point)
-            if step + 1 < steps:
-                is_used &= rank_in_group(star, -evidence) < self.max_proposals
-            else:
-                is_used &= group_maximum(evidence, star) - evidence <= self.max_gap
-            star, point, damping, fields = (
-                array[is_used] for array in (star, point, damping, fields)
-            )
-        return self.average(*self.follow(star, point, fields, counts, flux), counts, flux)
 
-    def average(
-        self, star: np.ndarray, expansion: Expansion, counts: np.ndarray, flux: np.ndarray
-    ) -> tuple[np.ndarray, RefinedPsfs]:
-        """Return the numbers (m,) of stars, and the posterior means of their expansions.
-
-        For the arguments see `follow`, whose results are averaged.
+        Returns
+        -------
+        star, point : ndarray, shapes (m,) and (m, 8)
+            Stars and coefficients of distinct wavefronts, the best of a star first.
         """
+        *_, (deviance, score, information) = self.measure(point, counts[star], flux[star])
+        fields = self.prior.select_fields(point, self.fields_kept)
+        components = self.prior.condition(point, score, information + damping, fields)
+        # Integral of prior × likelihood × damping; steps lead to the largest component.
+        evidence, point = components.evidence - 0.5 * deviance, point + components.mode
+        order = np.lexsort((-evidence, star))
+        star, evidence, point = star[order], evidence[order], point[order]
+        # Near a better wavefront of the star no other one is needed, nor with much less evidence.
+        is_used = self.find_distinct(star, point)
+        is_used &= group_maximum(evidence, star) - evidence <= self.max_gap
+        star, point = star[is_used], point[is_used]
+        is_best = rank_in_group(star, np.arange(len(star))) < self.max_wavefronts
+        return star[is_best], point[is_best]
+
+    @staticmethod
+    def average(star: np.ndarray, expansion: Expansion) -> tuple[np.ndarray, RefinedPsfs]:
+        """Return the numbers (m,) of stars, and the posterior means of the results of `follow`."""
         # Means over the wavefronts of a star, with their posterior probabilities.
         stars, number = np.unique(star, return_inverse=True)
         evidence = np.full(len(stars), -np.inf)
         np.logaddexp.at(evidence, number, expansion.evidence)
         weight = np.exp(expansion.evidence - evidence[number])[:, None]
         mean, scatter = expansion.moments()
-        psf, variance = np.zeros((2, len(stars), counts.shape[1]))
+        psf, variance = np.zeros((2, len(stars), mean.shape[1]))
         np.add.at(psf, number, weight * mean)
         np.add.at(variance, number, weight * (scatter + (mean - psf[number]) ** 2))
         return stars, RefinedPsfs(psf, variance, evidence)
@@ -607,7 +589,6 @@ class Refiner:
         self,
         star: np.ndarray,
         point: np.ndarray,
-        likely_fields: np.ndarray,
         counts: np.ndarray,
         flux: np.ndarray,
     ) -> tuple[np.ndarray, Expansion]:
@@ -615,9 +596,7 @@ class Refiner:
 
         Parameters
         ----------
-        star : ndarray of int, shape (n,)
-            Stars of the wavefronts.
-        point, likely_fields : ndarray, shapes (n, 8) and (n, f)
+        star, point : ndarray, shapes (n,) and (n, 8)
             Results of `begin`.
         counts, flux : ndarray, shapes (N, P) and (N,)
             Photons of all stars; see `begin`.
@@ -629,8 +608,7 @@ class Refiner:
         expansion : Expansion
             Expansions with the components that belong to them.
         """
-        stars, every_field = star, likely_fields
-        expansion = self.expand(point, counts[star], flux[star], likely_fields)
+        stars, expansion = star, self.expand(point, counts[star], flux[star])
         for _ in range(2, self.max_steps):
             components, distance = self.assign(stars, expansion)
             # Mass of the components that are far from all expansion points.
@@ -645,12 +623,11 @@ class Refiner:
             is_next &= log_far_total[stars] > log_total[stars] + np.log(self.min_far_mass)
             if not is_next.any():
                 break
-            star, likely_fields = stars[is_next], every_field[is_next]
             rows, component = np.flatnonzero(is_next), far_log_mass[is_next].argmax(axis=1)
             point = expansion.point[rows] + expansion.components.shift[rows, component]
-            new = self.expand(point, counts[star], flux[star], likely_fields)
+            star = stars[rows]
+            new = self.expand(point, counts[star], flux[star])
             stars, expansion = np.concatenate([stars, star]), Expansion.join([expansion, new])
-            every_field = np.concatenate([every_field, likely_fields])
         components, _ = self.assign(stars, expansion)
         # Other points may have all components of an expansion.
         has_mass = np.isfinite(components.log_mass).any(axis=1)
@@ -686,35 +663,6 @@ class Refiner:
             is_given &= (partner < np.arange(len(star)))[:, None]
             log_mass[is_nearer & is_given] = -np.inf
         return replace(components, log_mass=log_mass), distance
-
-    def begin(
-        self, point: np.ndarray, damping: np.ndarray, counts: np.ndarray, flux: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Make a first, damped step from n wavefronts.
-
-        Parameters
-        ----------
-        point : ndarray, shape (n, 8)
-            Coefficients at which the climbs begin.
-        damping : ndarray, shape (n, 8, 8)
-            Inverse covariances that limit the step.
-        counts, flux : ndarray, shapes (n, P) and (n,)
-            Photons of the pixels, and of the star.
-
-        Returns
-        -------
-        evidence : ndarray, shape (n,)
-            Logarithm of the integral of prior × likelihood × damping, by the first expansion.
-        point : ndarray, shape (n, 8)
-            Next coefficients.
-        fields : ndarray of int, shape (n, f)
-            The most likely fields.
-        """
-        *_, (deviance, score, information) = self.measure(point, counts, flux)
-        evidence, step, fields = self.prior.find_fields(
-            point, score, information + damping, self.fields_kept
-        )
-        return evidence - 0.5 * deviance, point + step, fields
 
 
 def list_partners(group: np.ndarray) -> Iterator[np.ndarray]:

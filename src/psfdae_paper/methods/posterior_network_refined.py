@@ -2,10 +2,9 @@
 
 A second network, which continues the training of the posterior network, proposes wavefronts of a
 star. Gauss–Newton steps on the stamp of the telescope refine them
-(`psfdae_paper.bounds.refinement`), and importance samples about them give the posterior mean
-(`psfdae_paper.bounds.wavefront_samples`). This is the method `wavefront` with a network in place of
-its bank of simulated stars. Where no proposal is near the wavefront, the network is better: the
-result is a mean of both, weighted by their variances and the misfit of the wavefront.
+(`psfdae_paper.bounds.refinement`). Where the image determines the
+wavefront, the posterior mean about it has nearly the minimum error; elsewhere the network is
+better. The result is a mean of both, weighted by their variances and the misfit of the wavefront.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ if TYPE_CHECKING:
         Combination,
         NetworkStarts,
         RefinedPsfs,
+        Refiner,
     )
-    from psfdae_paper.bounds.wavefront_samples import WavefrontSampler
 
 
 PROPOSER = {
@@ -53,7 +52,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         Trained network of PSFs.
     proposer : WavefrontNetwork
         Trained network of wavefronts.
-    refiner : WavefrontSampler
+    refiner : Refiner
         Optics with the prior of the aberrations.
     combination : Combination
         Weights of the refined PSFs, and the factor of the standard deviations.
@@ -72,8 +71,6 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
             "relative_field": ("1", "field vectors, 1 at the edge on an axis"),
             "pixel": ("λ/D", "width of a pixel"),
             "obscuration": ("1", "linear central obscuration of the pupil"),
-            "jitter_px": ("pixel", "largest centring error"),
-            "tie": ("1", "relative difference up to which pixels are equally bright"),
             "combination": ("1", "factors of the weights of refined PSFs at each level"),
             "combined_scale": ("1", "factor of the combined standard deviations at each level"),
             "combined_ratio95": ("1", "of these, how many hold 95 % of the errors, at each level"),
@@ -86,7 +83,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         self,
         network: PosteriorNetwork,
         proposer: WavefrontNetwork,
-        refiner: WavefrontSampler,
+        refiner: Refiner,
         combination: Combination,
         history: list[dict[str, Any]] | None = None,
     ) -> None:
@@ -105,8 +102,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         """
         from psfdae_paper.bounds.estimates import build_stamp_model
         from psfdae_paper.bounds.posterior_network import WavefrontTraining
-        from psfdae_paper.bounds.refinement import Combination
-        from psfdae_paper.bounds.wavefront_samples import WavefrontSampler
+        from psfdae_paper.bounds.refinement import Combination, Refiner
 
         if data.simulation and data.simulation["scene"]["name"] != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
@@ -122,8 +118,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         latest = {key: history[-1][key] for key in ("epoch", "step", "seconds", "cpu_seconds")}
         for row in proposer_training.history:
             history.append({key: value + latest.get(key, 0) for key, value in row.items()})
-        model = build_stamp_model(training.config)
-        refiner = WavefrontSampler.from_model(model, data.noise, data.seed)
+        refiner = Refiner.from_model(build_stamp_model(training.config), data.noise)
         stars = training.draw_fresh_stars()
         # Every star at every noise level.
         count, levels = len(stars.stamps), np.sort(data.levels)
@@ -166,19 +161,15 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of network, optics and weights."""
-        refiner, proposer = self.refiner, self.proposer.to_arrays()
-        prior = refiner.prior
-        optics = {
-            "pixel": prior.pixel,
-            **{name: getattr(refiner, name) for name in ("obscuration", "jitter_px", "tie")},
-        }
+        prior, proposer = self.refiner.prior, self.proposer.to_arrays()
         return {
             **self.network.to_arrays(),
             **{f"wavefront_{name}": proposer[name] for name in PROPOSER},
             "seidel_mean": prior.mean,
             "seidel_sd": prior.sd,
             "relative_field": prior.field,
-            **{name: np.array([value]) for name, value in optics.items()},
+            "pixel": np.array([prior.pixel]),
+            "obscuration": np.array([self.refiner.obscuration]),
             "combination": self.combination.factors,
             "combined_scale": self.combination.sigma_scale,
             "combined_ratio95": self.combination.sigma_ratio95,
@@ -190,15 +181,13 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
     ) -> Self:
         """Return network and optics with the noise of the configuration."""
         from psfdae_paper.bounds.posterior_network import PosteriorNetwork, WavefrontNetwork
-        from psfdae_paper.bounds.refinement import Combination, SeidelPrior
-        from psfdae_paper.bounds.wavefront_samples import WavefrontSampler
+        from psfdae_paper.bounds.refinement import Combination, Refiner, SeidelPrior
 
-        noise, side = build_noise(config["noise"]), round(len(arrays["mean"]) ** 0.5)
-        optics = ("pixel", "obscuration", "jitter_px", "tie")
-        pixel, obscuration, *framing = (arrays[name].item() for name in optics)
+        noise = build_noise(config["noise"])
         seidel = arrays["seidel_mean"], arrays["seidel_sd"], arrays["relative_field"]
-        prior = SeidelPrior(*seidel, pixel)
-        refiner = WavefrontSampler(prior, obscuration, side, noise, config["seed"], *framing)
+        prior = SeidelPrior(*seidel, float(arrays["pixel"][0]))
+        side = round(len(arrays["mean"]) ** 0.5)
+        refiner = Refiner(prior, float(arrays["obscuration"][0]), side, noise)
         names = ("levels", "combination", "combined_scale", "combined_ratio95")
         combination = Combination(*(arrays[name] for name in names))
         proposer = {**arrays, **{name: arrays[f"wavefront_{name}"] for name in PROPOSER}}
