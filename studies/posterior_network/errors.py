@@ -3,9 +3,9 @@
     python studies/posterior_network/errors.py RESULTS DATASET FIT.h5 OUT.csv [OVERRIDE ...]
 
 RESULTS is the folder of a run with the stars of DATASET; settings are changed by overrides such as
-posterior_network.epochs=8. The least possible errors are those of the run of record. The fit is
-written to FIT.h5, or read from there if it exists, and its history to FIT.csv; `fit_cpu_s` is the
-CPU time of its epochs. One thread.
+posterior_network.epochs=8, or seed=1; test stars stay the same. The least possible errors are those
+of the run of record. The fit is written to FIT.h5, or read from there if it exists, and its history
+to FIT.csv; `fit_cpu_s` is the CPU time of its epochs. One thread.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def main(results, dataset, place, out, *overrides):
         kinds = config, refined, product, SPLIT, "realisation"
         fit(training_set(*kinds, checkpoint=place.with_suffix(".pt")), config, place)
     fitted, settings = refined.load(place), refined.read_config(place)
-    tested, path = read_test_stars(config, product), Path(out)
+    tested, path = read_test_stars(load([f"dataset={dataset}"]), product), Path(out)
     # The network alone is a part of the same fit.
     alone = method("posterior_network")(fitted.network)
     methods = {
@@ -99,6 +99,7 @@ def main(results, dataset, place, out, *overrides):
         {
             "dataset": dataset,
             "method": name,
+            "seed": settings["seed"],
             "epochs": settings["posterior_network"]["epochs"],
             "stars_per_epoch": settings["posterior_network"]["stars"],
             "fit_cpu_s": f"{settings['fit_cpu_s'][trainings]:.1f}",

@@ -51,10 +51,8 @@ def main(results, dataset, place, out):
     config = load([f"dataset={dataset}"])
     product = read_product(Path(results) / STARS[dataset], "stars")
     tested, least = read_test_stars(config, product), read_least_errors(dataset)
-    fitted, truth = (
-        method("posterior_network_refined").load(Path(place)),
-        tested.truth["realisation"],
-    )
+    fitted = method("posterior_network_refined").load(Path(place))
+    truth, refiner = tested.truth["realisation"], fitted.refiner
     kinds = [(positions, number, False) for positions in POSITIONS for number in (1, 3, 8)]
     kinds.append((Refiner.positions, Refiner.proposals + 1, True))
     rows = []
