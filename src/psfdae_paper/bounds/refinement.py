@@ -382,6 +382,8 @@ class Refiner:
         Pixels d along a side.
     noise : NoiseModel
         Photon noise of the images.
+    jitter_px : int
+        Largest centring error of a stamp in pixels per axis.
     proposals : int
         Maximum number of proposals from which a star's climbs start.
     min_weight : float
@@ -415,6 +417,7 @@ class Refiner:
     obscuration: float
     stamp_px: int
     noise: NoiseModel
+    jitter_px: int
     proposals: ClassVar[int] = 3
     min_weight: ClassVar[float] = 0.02
     positions: ClassVar[tuple[float, ...]] = (-1.5, 0.0, 1.5)
@@ -439,7 +442,8 @@ class Refiner:
     def from_model(cls, model: StampModel, noise: NoiseModel) -> Self:
         """Return the optics of a dataset's stamps with photon noise."""
         prior = SeidelPrior(model.mean, model.sd, model.field, model.telescope.pixel)
-        return cls(prior, model.telescope.obscuration, model.framing.stamp_px, noise)
+        framing = model.framing
+        return cls(prior, model.telescope.obscuration, framing.stamp_px, noise, framing.jitter_px)
 
     @cached_property
     def _operator(self) -> SampledStamps:
@@ -566,6 +570,24 @@ class Refiner:
         np.add.at(psf, number, weight * mean)
         np.add.at(variance, number, weight * (scatter + (mean - psf[number]) ** 2))
         return stars, RefinedPsfs(psf, variance, evidence)
+
+    def measure_misfit(self, refined: RefinedPsfs) -> np.ndarray:
+        """Return scores (n,) that are large for stars unlike those of the telescope.
+
+        A score is −2 ln of the evidence, plus the square of the significance with which the
+        brightest pixel is farther from the middle than a centring error.
+        """
+        # Brightest pixels among those that a star is centred on, and among the others.
+        distance = np.abs(np.arange(self.stamp_px) - self.stamp_px // 2)
+        is_middle = np.maximum.outer(distance, distance).ravel() <= self.jitter_px
+        star = np.arange(len(refined.psf))
+        inner, outer = (
+            np.where(is_part, refined.psf, -np.inf).argmax(axis=1)
+            for is_part in (is_middle, ~is_middle)
+        )
+        excess = refined.psf[star, outer] - refined.psf[star, inner]
+        variance = refined.variance[star, outer] + refined.variance[star, inner]
+        return np.asarray(np.maximum(excess, 0.0) ** 2 / variance - 2.0 * refined.evidence)
 
     @cached_property
     def root(self) -> np.ndarray:

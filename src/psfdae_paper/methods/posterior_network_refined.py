@@ -71,6 +71,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
             "relative_field": ("1", "field vectors, 1 at the edge on an axis"),
             "pixel": ("λ/D", "width of a pixel"),
             "obscuration": ("1", "linear central obscuration of the pupil"),
+            "jitter_px": ("pixel", "largest centring error of a stamp per axis"),
             "combination": ("1", "factors of the weights of refined PSFs at each level"),
             "combined_scale": ("1", "factor of the combined standard deviations at each level"),
             "combined_ratio95": ("1", "of these, how many hold 95 % of the errors, at each level"),
@@ -150,9 +151,8 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         levels = np.broadcast_to(np.asarray(level, np.float64), len(noisy))
         starts, refined = self.refine(noisy, levels)
         psf, sigma = self.combination.combine(levels, starts, refined)
-        # A star that no wavefront of the telescope explains has a small evidence.
         images = psf.reshape(noisy.shape), sigma.reshape(noisy.shape)
-        return Estimate(*images, outlier_score=-2.0 * refined.evidence)
+        return Estimate(*images, outlier_score=self.refiner.measure_misfit(refined))
 
     @property
     def calibration(self) -> tuple[np.ndarray, np.ndarray]:
@@ -170,6 +170,7 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
             "relative_field": prior.field,
             "pixel": np.array([prior.pixel]),
             "obscuration": np.array([self.refiner.obscuration]),
+            "jitter_px": np.array([self.refiner.jitter_px]),
             "combination": self.combination.factors,
             "combined_scale": self.combination.sigma_scale,
             "combined_ratio95": self.combination.sigma_ratio95,
@@ -187,7 +188,8 @@ class RefinedPosteriorNetwork(PhotonMethod, PosteriorNetworkMethod):
         seidel = arrays["seidel_mean"], arrays["seidel_sd"], arrays["relative_field"]
         prior = SeidelPrior(*seidel, float(arrays["pixel"][0]))
         side = round(len(arrays["mean"]) ** 0.5)
-        refiner = Refiner(prior, float(arrays["obscuration"][0]), side, noise)
+        obscuration, jitter_px = (arrays[name].item() for name in ("obscuration", "jitter_px"))
+        refiner = Refiner(prior, obscuration, side, noise, jitter_px)
         names = ("levels", "combination", "combined_scale", "combined_ratio95")
         combination = Combination(*(arrays[name] for name in names))
         proposer = {**arrays, **{name: arrays[f"wavefront_{name}"] for name in PROPOSER}}

@@ -290,6 +290,17 @@ def test_a_star_with_a_companion_has_little_evidence(model):
     assert np.mean(strange > np.quantile(usual, 0.95)) > 0.8
 
 
+def test_a_star_off_centre_by_more_than_a_centring_error_has_a_large_misfit(model):
+    refiner = build_refiner(model)
+    psf, variance = np.full((4, 256), 1e-3), np.full((4, 256), 1e-6)
+    reach, images = refiner.jitter_px, psf.reshape(4, 16, 16)
+    images[0, 8, 8] = images[1, 8 + reach, 8 - reach] = images[2, 9 + reach, 8] = 0.1
+    # A pixel outside that is brighter by two standard deviations of a difference.
+    images[3, 8, 8], images[3, 7 - reach, 8] = 0.1, 0.1 + 2e-3 * np.sqrt(2.0)
+    misfit = refiner.measure_misfit(RefinedPsfs(psf, variance, np.array([-5.0, -6.0, -7.0, -8.0])))
+    assert misfit == pytest.approx([10.0, 12.0, 14.0 + 0.099**2 / 2e-6, 16.0 + 4.0])
+
+
 def test_refined_wavefront_is_the_maximum_of_the_posterior(model, monkeypatch):
     """In its field, at little noise, the refined PSF is the stamp of the climb's mode."""
     stamps, z, field, offset, point = draw_stars(model, 12, 6)
