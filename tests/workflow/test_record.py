@@ -143,11 +143,16 @@ def test_a_later_run_completes_the_record_of_its_commit(results, history, tmp_pa
     assert (out / "tables/t.csv").read_text() == "a\n1\n"
     new_run = {"commit": commit, "date": date.today().isoformat()}
     assert recorded(out) == before | {"other_runs": {SLOW: new_run}}
-    # A record of another commit cannot be completed, and stays as it is.
-    history()
-    with pytest.raises(ProductError, match=r"runtime\.csv: missing or out of date"):
-        record.reference(later, out, [plan(later, **pending, **{SLOW: "no update"})])
-    assert recorded(out)["commit"] == commit
+    # Of another commit, only tables that take long are added; the costs of images name their own.
+    second = history()
+    written(later / "tables/t.csv", "a\n2\n")
+    written(later / record.IMAGE_COSTS[0], f"image,commit,date\ni,{commit},2026-01-02\n")
+    current = {"tables/t.csv": "no update", SLOW: "no update"}
+    record.reference(later, out, [plan(later, **pending | current)])
+    assert (out / "tables/t.csv").read_text() == "a\n1\n"
+    runs = {SLOW: new_run | {"commit": second}}
+    runs[record.IMAGE_COSTS[0]] = {"commit": commit, "date": "2026-01-02"}
+    assert recorded(out) == before | {"other_runs": runs}
 
 
 @pytest.mark.parametrize(

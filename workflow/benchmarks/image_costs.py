@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tarfile
 from dataclasses import replace
+from datetime import date
 from importlib.util import find_spec
 from io import BytesIO
 from itertools import chain
@@ -28,6 +29,7 @@ import click
 from figures import image_growth
 from psfdae.base.figures import apply_style, write_png
 from psfdae.base.files import write_csv
+from psfdae_paper.source import git_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 FIELDS = "512:200 900:700 2048:2000"
@@ -128,13 +130,15 @@ def compare_tools(image, against, fields, growth, results):
     """Time models and photometry of simulated images and of each IMAGE, on a quiet machine.
 
     The folder RESULTS gets tables/benchmark_images.csv, with a row for each image, tool and step,
-    without costs where the tool failed, and figures/benchmark/images.png, of the growth. Stars are
-    those that were simulated. The ratio of the CPU time to the earlier commit's is printed.
+    without costs where the tool failed, and figures/benchmark/images.png, of the growth. Each row
+    has the date and the commit. Stars are those that were simulated. The ratio of the CPU time to
+    the earlier commit's is printed.
     """
     import pandas as pd
     from astropy.io import fits
 
     rows, failures, commit = [], 0, against or BEFORE
+    run = {"date": date.today().isoformat(), "commit": git_commit()}
     # Images for all tools, then those for psfdae at this commit.
     images = [*dict.fromkeys([*fields, *image])]
     own_images = [*dict.fromkeys(size for size in growth if size not in fields)]
@@ -155,7 +159,7 @@ def compare_tools(image, against, fields, growth, results):
             else:
                 runs = list_own_runs(path, {"psfdae": ROOT}, folder)
             for tool, step, words, environment in runs:
-                row = about | {"tool": tool, "step": step, "cpu_s": None, "peak_mb": None}
+                row = about | {"tool": tool, "step": step, "cpu_s": None, "peak_mb": None} | run
                 try:
                     row |= measure_process(words, folder, environment)
                 except click.ClickException as error:

@@ -33,8 +33,11 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.source import cpu_model, git
 
-MAY_STAY = re.compile(r"(sweeps|paper)/.+")
-"""Names of products that may stay from an earlier record, because they take too long to compute."""
+IMAGE_COSTS = ("tables/benchmark_images.csv", "figures/benchmark/images.png")
+"""Files of `make benchmark TARGETS=images`, which names date and commit in its table."""
+
+MAY_STAY = re.compile("|".join([r"(sweeps|paper)/.+", *map(re.escape, IMAGE_COSTS)]))
+"""Names of files that may stay from an earlier record, because they take too long to compute."""
 
 
 @command("paper runtime")
@@ -98,8 +101,8 @@ def reference(
     The new record belongs to the commit that is checked out. Code, workflow and settings must not
     differ from it, and Snakemake must find every file up to date with them, on whatever machine it
     was computed. Files that take long (`MAY_STAY`) and are not up to date stay from the earlier
-    record. A run without runtime.csv completes a record of the same commit: its files are added,
-    and all others stay.
+    record. A run without runtime.csv completes the earlier record: such files, and all files if it
+    has the same commit, are added; the others stay.
 
     The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
     from these files alone. Provenance describes the run of runtime.csv; its entry `other_runs` has
@@ -118,9 +121,12 @@ def reference(
     commit = clean_commit()
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
-    is_completed = earlier.get("commit") == commit and not (results / "runtime.csv").is_file()
+    is_completed = bool(earlier) and not (results / "runtime.csv").is_file()
     may_stay = re.compile(".+") if is_completed else MAY_STAY
     new_names = list_current_files(results, plans, may_stay)
+    if is_completed and earlier["commit"] != commit:
+        new_names = [name for name in new_names if MAY_STAY.fullmatch(name)]
+    new_names += [name for name in IMAGE_COSTS if (results / name).is_file()]
     # Files of the earlier record that stay; those of a run of its own keep its date and commit.
     files = (path for path in sorted(out.rglob("*")) if path.is_file() and path != provenance_path)
     names = (path.relative_to(out).as_posix() for path in files)
@@ -135,6 +141,10 @@ def reference(
         record = provenance(results, load()) | {"commit": commit}
         earlier_run = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
         other_runs = {name: run or earlier_run for name, run in other_runs.items()}
+    if IMAGE_COSTS[0] in new_names:
+        row = read_table(results / IMAGE_COSTS[0], "commit", "date").iloc[-1]
+        image_run = {"commit": row.commit, "date": row.date}
+        other_runs |= {name: image_run for name in IMAGE_COSTS if name in new_names}
     # A commit that is in the history can be checked out again.
     for name, run in other_runs.items():
         try:
