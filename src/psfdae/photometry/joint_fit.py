@@ -216,7 +216,7 @@ class _Fit:
         # Positions that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_position, self.pull = self.start, 0.0
         # A star moves so little that its PSF stays as it is at the start, of these fluxes.
-        self._psf_flux = self.flux.copy()
+        self._mix_psfs()
         self._corner = np.empty((len(self.stars), 2), int)
         self._light = np.empty((len(self.stars), psfs.psf_px, psfs.psf_px), np.float32)
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
@@ -227,7 +227,7 @@ class _Fit:
             self.flux = self.solve_fluxes()
             # Where the PSF changes with the magnitude, these fluxes determine it from now on.
             if self.psfs.magnitudes.size:
-                self._psf_flux = self.flux.copy()
+                self._mix_psfs()
                 self._draw(rows)
         self._subtract(rows, self.flux)
 
@@ -239,20 +239,29 @@ class _Fit:
         row, column = (corner[:, k, None] + np.arange(side_px) + self.border for k in (1, 0))
         return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
+    def _mix_psfs(self) -> None:
+        """Mix the PSFs of the stars for their fluxes; PSFs of over 100 MB are mixed as needed."""
+        self._psf_flux, self._splines = self.flux.copy(), None
+        if len(self.stars) * self.psfs.splines[0].nbytes < 100e6:
+            self._splines = self.psfs.mix_splines(self.start, self._psf_flux)
+
     def _draw(self, rows: np.ndarray) -> None:
         """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
-        # 256 stars at a time: PSFs of all stars would take more memory than the image.
+        # 256 stars at a time, for memory.
         for part in np.array_split(rows, len(rows) // 256 + 1):
             position, box_corner = self.position[part], self._middle[part] - self.box_px // 2
-            splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+            if self._splines is None:
+                psfs = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+                splines = psfs, np.arange(len(part))
+            else:
+                splines = self._splines, part
             self._corner[part] = self.psfs.find_corners(position)
             stamps = position, self._corner[part], self.psfs.psf_px
             self._light[part] = self.psfs.stamps(*stamps, splines=splines)
             # The box stays where it is while the stamp moves with its star: its light is drawn by
             # itself, with its derivatives.
             box = position, box_corner, self.box_px
-            self._derivatives[part, 0] = self.psfs.stamps(*box, splines=splines)
-            self._derivatives[part, 1:] = self.psfs.slopes(*box, splines=splines)
+            self._derivatives[part] = self.psfs.stamps_and_slopes(*box, splines=splines)
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""

@@ -101,9 +101,8 @@ def measure_gain(
         # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
         corner = np.stack([column, row], axis=1) - half
         design = np.ones((len(position), 4, len(axis) ** 2))
-        stars = position, corner, len(axis)
-        design[:, 0] = psfs.stamps(*stars).reshape(len(position), -1)
-        design[:, 1:3] = psfs.slopes(*stars).reshape(len(position), 2, -1)
+        star_light = psfs.stamps_and_slopes(position, corner, len(axis))
+        design[:, :3] = star_light.reshape(len(position), 3, -1)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted_design = design / variance[..., None]
