@@ -123,12 +123,12 @@ def find_spikes(
     spikes, cores = np.zeros(image.shape, dtype=bool), find_saturated_cores(is_saturated)
     if not len(cores):
         return spikes
-    from skimage.transform import warp_polar
-
     snr = smooth_light(image, bad, sky) / sky.noise
     part_px, angles, parts = 8, 720, 32
     reach_px = part_px * parts
-    shape = angles, reach_px
+    # Rows and columns of the pixels of all rays, from the core.
+    turn = 2.0 * np.pi * np.arange(angles)[:, None] / angles
+    rays_at = np.stack([np.sin(turn), np.cos(turn)]) * np.arange(reach_px)
     for x, y, core_px in cores:
         middle = y, x
         first_part = int(2.0 * core_px / part_px) + 1
@@ -136,7 +136,8 @@ def find_spikes(
         if first_part >= parts:
             continue
         # Lower and upper quartiles of the S/N in parts of 8 px of rays, one ray every half degree.
-        rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
+        at = rays_at + np.array(middle)[:, None, None]
+        rays = scipy.ndimage.map_coordinates(snr, at, order=1, cval=np.nan)
         quartiles = np.percentile(rays.reshape(angles, parts, part_px), [25, 75], axis=2)
         quartiles = quartiles[:, :, first_part:]
         is_outside = ~np.isfinite(quartiles)
