@@ -123,7 +123,7 @@ def fit_stars(
         gain = np.bincount(group, cost - new_cost)
         is_worse, is_poor = ((gain < part * expected_gain)[group] & moving for part in (-0.5, 0.1))
         back = np.flatnonzero(is_worse)
-        fit.move(back, -step[back])
+        fit.take_back(back, step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.cost() if len(back) else new_cost
         # A cluster in whose boxes nothing has changed, and that is not damped, would get the same
@@ -279,12 +279,26 @@ class _Fit:
         return self.solve(design, np.zeros(1), np.zeros(len(rows)), rows)[0][:, 0]
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
-        """Change flux, x and y of some stars by (k, 3)."""
+        """Change flux, x and y of some stars, ascending, by (k, 3)."""
+        drawn = self._corner, self._light, self._derivatives
+        self._before_move = rows, [values[rows] for values in drawn]
         # The old light is added to the residuals, and the light at the new position is subtracted.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
         self.position[rows] += change[:, 1:]
         self._draw(rows)
+        self._subtract(rows, self.flux[rows])
+
+    def take_back(self, rows: np.ndarray, change: np.ndarray) -> None:
+        """Take the last change (k, 3) of some of the moved stars back, which are not drawn anew."""
+        self._subtract(rows, -self.flux[rows])
+        self.flux[rows] -= change[:, 0]
+        self.position[rows] -= change[:, 1:]
+        moved_rows, drawn_before = self._before_move
+        at = np.searchsorted(moved_rows, rows)
+        drawn = self._corner, self._light, self._derivatives
+        for values, before in zip(drawn, drawn_before, strict=True):
+            values[rows] = before[at]
         self._subtract(rows, self.flux[rows])
 
     def design(self, rows: np.ndarray) -> np.ndarray:

@@ -242,12 +242,13 @@ class PsfGrid:
             number = 0
             for down_weight, across_weights in terms:
                 sums = (down_weight[batch, None] @ taps).reshape(-1, side_px, span)
+                columns = [sums[:, :, tap : tap + span - 3 : between] for tap in range(4)]
                 for across_weight in across_weights:
-                    values[batch, number] = sum(
-                        across_weight[batch, tap, None, None]
-                        * sums[:, :, tap : tap + span - 3 : between]
-                        for tap in range(4)
-                    )
+                    weight = across_weight[batch, :, None, None]
+                    total = weight[:, 0] * columns[0]
+                    for tap in (1, 2, 3):
+                        total += weight[:, tap] * columns[tap]
+                    values[batch, number] = total
                     number += 1
         values *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
         return values
