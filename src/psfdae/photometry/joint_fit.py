@@ -187,8 +187,11 @@ class _Fit:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
         # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
         self.border = psfs.side_px + int(np.ceil(2.0 * range_px))
-        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float32), self.border)
-        weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), self.border)
+        shape = [side_px + 2 * self.border for side_px in image.shape]
+        self.residual, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._core = (np.s_[self.border : -self.border],) * 2
+        np.copyto(self.residual[self._core], image, "same_kind", where=~bad)
+        np.divide(1.0, error, out=weight[self._core], where=~bad, casting="same_kind")
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
         on_image = np.isfinite(position).all(axis=1)
@@ -374,9 +377,8 @@ class _Fit:
             return column
 
         # The light of all stars is what the image has beyond the residuals.
-        core = np.s_[self.border : -self.border]
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
-        np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
+        np.subtract(light, self.residual[self._core], out=light, casting="same_kind")
         return JointFit(
             fill_rows(self.position),
             fill_rows(error[:, 1:]),

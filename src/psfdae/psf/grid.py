@@ -109,6 +109,8 @@ class PsfGrid:
         # A product with a sparse matrix, whose rows have the weights of the nodes.
         ends, size = np.arange(len(node) + 1) * node.shape[1], (len(node), len(self.splines))
         weights = csr_array((share.astype(np.float32).ravel(), node.ravel(), ends), shape=size)
+        # Of a faint or a bright star, whose PSF is that at one magnitude, eight of twelve are 0.
+        weights.eliminate_zeros()
         mean_spline = weights @ self.splines.reshape(len(self.splines), -1)
         return np.asarray(mean_spline.reshape(len(centre), *self.splines.shape[1:]))
 
