@@ -17,7 +17,7 @@ import scipy
 from psfdae.base.types import Header
 from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, pixel_noise
-from psfdae.stars.moments import robust_scatter
+from psfdae.stars.moments import middle_value, robust_scatter, row_medians
 
 
 @dataclass(frozen=True)
@@ -585,7 +585,7 @@ def measure_sharpness(
         clean = fill_bad(image[rows], hidden)[0]
         edge = compute_edges(clean)
         # Local maxima, so bright that noise does not matter, and not saturated.
-        above = clean - np.median(clean)
+        above = clean - middle_value(clean.ravel())
         top = (clean == scipy.ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
         row, column = np.nonzero(top & ~hidden)
         is_usable = np.empty(len(row), dtype=bool)
@@ -636,7 +636,7 @@ def _measure_height(edge: np.ndarray, row: np.ndarray, column: np.ndarray) -> np
     """
     height = np.empty(len(row))
     for part, fives in _cut_windows(edge, row, column, 2):
-        height[part] = fives[:, 2, 2] - np.median(fives.reshape(-1, 25), axis=1)
+        height[part] = fives[:, 2, 2] - row_medians(fives.reshape(-1, 25))
     return height
 
 
@@ -650,8 +650,8 @@ def _measure_structure(image: np.ndarray, row: np.ndarray, column: np.ndarray) -
         # Medians over 3 × 3 pixels at the 7 × 7 positions about the pixel; the one in the middle
         # is its own.
         threes = np.lib.stride_tricks.sliding_window_view(nines, (3, 3), axis=(1, 2))
-        medians = np.median(threes.reshape(-1, 7, 7, 9), axis=3)
-        structure[part] = medians[:, 3, 3] - np.median(medians.reshape(-1, 49), axis=1)
+        medians = row_medians(threes.reshape(-1, 9)).reshape(-1, 7, 7)
+        structure[part] = medians[:, 3, 3] - row_medians(medians.reshape(-1, 49))
     return structure
 
 
@@ -666,7 +666,7 @@ def _measure_noise(
     scatter = np.empty(len(row))
     for part, nines in _cut_windows(image, row, column, 4):
         difference = np.abs(np.diff(nines, axis=2)).reshape(-1, 72)
-        scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
+        scatter[part] = 1.4826 / np.sqrt(2.0) * row_medians(difference)
     return np.asarray(np.maximum(scatter, noise[row, column]))
 
 

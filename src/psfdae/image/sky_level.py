@@ -23,6 +23,7 @@ from psfdae.stars.moments import (
     count_step,
     cubic_splines,
     dither,
+    middle_value,
     remove_dither,
     robust_scatter,
     row_medians,
@@ -315,7 +316,7 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
     # 2¹⁶ pairs are enough, evenly spread: ρ has the error 0.006.
     step = np.count_nonzero(is_finite) // 2**16 + 1
     a, b = a[is_finite][::step], b[is_finite][::step]
-    plus, minus = (float(np.median(np.abs(v - np.median(v)))) ** 2 for v in (a + b, a - b))
+    plus, minus = (float(middle_value(np.abs(v - middle_value(v)))) ** 2 for v in (a + b, a - b))
     return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
 
 
@@ -613,7 +614,7 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
             return np.asarray((light[last] - light[first]) / (number[last] - number[first]))
 
         with np.errstate(all="ignore"):
-            return means(start, end) - means(-end, -start)
+            return np.asarray(means(start, end) - means(-end, -start))
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of rows without good pixels

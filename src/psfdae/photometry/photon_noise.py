@@ -19,7 +19,7 @@ from psfdae.image.camera import CameraValue
 from psfdae.image.image import Image
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-from psfdae.stars.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD, middle_value
 
 
 def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
@@ -179,7 +179,7 @@ def photon_transfer(
         for values in (light_over_variance, light * light_over_variance)
     )
     modulus = np.abs(residual / sigma)
-    variance = np.array([SIGMA_OF_MAD * np.median(modulus[members]) for members in bins]) ** 2
+    variance = np.array([SIGMA_OF_MAD * middle_value(modulus[members]) for members in bins]) ** 2
     # Weighted least squares of a and b ≥ 0 in v/σ² − 1 = a L/σ² + b L²/σ²; weights follow from the
     # variances that the last fit expects.
     expected_variance = np.maximum(variance, 1.0)

@@ -11,6 +11,7 @@ unweighted second moments, and less on single pixels than a contour at half the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,14 +47,15 @@ def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarr
     return np.array([middle_value(group) if group.size else np.nan for group in groups])
 
 
-def middle_value(values: np.ndarray) -> float:
-    """Return the median of numbers (n,), as `np.median` does in four times the time if n is small.
+def middle_value(values: np.ndarray) -> Any:
+    """Return the median of one or more finite numbers (n,), in an eighth of `np.median`'s time.
 
-    It is the mean of the two middle ones in their order, or the middle one.
+    It is the middle one in their order, or the mean of the two middle ones, of the array's type.
     """
-    low, high = (len(values) - 1) // 2, len(values) // 2
-    ordered = np.partition(values, (low, high))
-    return 0.5 * (ordered[low] + ordered[high])
+    # numpy parts an array at one index with the processor's vectors, and at two without them.
+    half = len(values) // 2
+    ordered = np.partition(values, half)
+    return ordered[half] if len(values) % 2 else 0.5 * (ordered[:half].max() + ordered[half])
 
 
 def row_medians(values: np.ndarray) -> np.ndarray:
@@ -79,7 +81,8 @@ def count_step(values: np.ndarray) -> float:
     if distinct.size < 2 or not differences.size:
         return 0.0
     step = float(np.diff(distinct).min())
-    return step if robust_scatter(differences) < 10.0 * np.sqrt(2.0) * step else 0.0
+    scatter = SIGMA_OF_MAD * middle_value(np.abs(differences - middle_value(differences)))
+    return step if scatter < 10.0 * np.sqrt(2.0) * step else 0.0
 
 
 def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
