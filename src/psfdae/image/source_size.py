@@ -16,7 +16,7 @@ import numpy as np
 
 from psfdae.image.errors import silent
 from psfdae.image.stamps import cut, cut_image
-from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, robust_scatter
+from psfdae.stars.moments import FWHM_OF_SIGMA, find_centroids, middle_value, robust_scatter
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,7 @@ def ring_light(values: np.ndarray, radius: np.ndarray, edges: np.ndarray) -> np.
         if not len(pixels):
             continue
         if edges[k + 1] > 4:
-            # Median: the mean of the one or two middle values.
-            low, high = (len(pixels) - 1) // 2, len(pixels) // 2
-            pixels = np.partition(pixels, (low, high))
-            light[k] = 0.5 * (pixels[low] + pixels[high])
+            light[k] = middle_value(pixels)
         else:
             light[k] = pixels.mean()
     return light

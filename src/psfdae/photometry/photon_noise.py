@@ -19,7 +19,7 @@ from psfdae.image.camera import CameraValue
 from psfdae.image.image import Image
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-from psfdae.stars.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD, middle_value
 
 
 def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
@@ -101,9 +101,8 @@ def measure_gain(
         # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
         corner = np.stack([column, row], axis=1) - half
         design = np.ones((len(position), 4, len(axis) ** 2))
-        stars = position, corner, len(axis)
-        design[:, 0] = psfs.stamps(*stars).reshape(len(position), -1)
-        design[:, 1:3] = psfs.slopes(*stars).reshape(len(position), 2, -1)
+        star_light = psfs.stamps_and_slopes(position, corner, len(axis))
+        design[:, :3] = star_light.reshape(len(position), 3, -1)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted_design = design / variance[..., None]
@@ -165,8 +164,6 @@ def photon_transfer(
     Bins of about 60 pixels of equal light have the variance (1.48 median |r/σ|)² ± 2.33/√n of
     itself, and v/σ² − 1 = (L/σ²)/g + ε² L²/σ² is fitted to them; both terms are at least 0.
     """
-    from scipy.optimize import nnls
-
     # Bins of pixels in the order of L/σ²; pixels where it is below 0.02 show no photon noise.
     light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
     light_over_variance = light / sigma**2
@@ -182,16 +179,33 @@ def photon_transfer(
         for values in (light_over_variance, light * light_over_variance)
     )
     modulus = np.abs(residual / sigma)
-    variance = np.array([SIGMA_OF_MAD * np.median(modulus[members]) for members in bins]) ** 2
+    variance = np.array([SIGMA_OF_MAD * middle_value(modulus[members]) for members in bins]) ** 2
     # Weighted least squares of a and b ≥ 0 in v/σ² − 1 = a L/σ² + b L²/σ²; weights follow from the
     # variances that the last fit expects.
     expected_variance = np.maximum(variance, 1.0)
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected_variance)
         design = np.stack([linear, square], axis=1) * weight[:, None]
-        coefficients, residual_norm = nnls(design, (variance - 1.0) * weight)
+        coefficients, residual_square = solve_not_negative(design, (variance - 1.0) * weight)
         expected_variance = 1.0 + coefficients[0] * linear + coefficients[1] * square
     # Standard error of a; where the law does not hold, it is known as badly as χ² says.
-    excess = max(residual_norm**2 / (len(bins) - 2), 1.0)
+    excess = max(residual_square / (len(bins) - 2), 1.0)
     error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])
     return float(coefficients[0]), float(error), float(np.sqrt(coefficients[1]))
+
+
+def solve_not_negative(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the two numbers (2,), none below 0, with the least squares |D x − y|², and these.
+
+    Parameters
+    ----------
+    design, values : ndarray, shape (n, 2) and (n,)
+        D and y.
+    """
+    normal, projection = design.T @ design, design.T @ values
+    solution = np.linalg.solve(normal, projection)
+    if (solution < 0).any():
+        # One of them is 0: y·d/d² of the column d that explains more, or 0 if that is less.
+        alone = np.maximum(projection, 0.0) / np.diag(normal)
+        solution = np.where(np.arange(2) == np.argmax(alone * projection), alone, 0.0)
+    return solution, float(np.square(design @ solution - values).sum())

@@ -14,6 +14,7 @@ from astropy.wcs import WCS
 from photutils.aperture import CircularAperture
 from photutils.psf import PSFPhotometry
 from scipy.ndimage import uniform_filter
+from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
@@ -30,7 +31,7 @@ from psfdae.image.trails import find_saturated_cores
 from psfdae.photometry import crowded, wings_fit
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.image_photometry import add_unmeasured_rows
-from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
+from psfdae.photometry.photon_noise import add_measured_gain, measure_gain, solve_not_negative
 from psfdae.photometry.wings_fit import (
     StarFluxes,
     around_stars,
@@ -345,6 +346,20 @@ def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     assert measure_gain(model, noisy, noise, good, place[:9]) is None
 
 
+def test_terms_of_the_photon_noise_are_those_of_nonnegative_least_squares():
+    """Both above 0, one of them 0, or both; the second has the square of the light."""
+    rng, zeros = np.random.default_rng(6), set()
+    for _ in range(60):
+        design = rng.uniform(0.0, 1.0, (20, 2)) * [1.0, 1e4]
+        values = design @ (rng.normal(size=2) * [1.0, 1e-4]) + rng.normal(0.0, 0.3, 20)
+        expected, norm = nnls(design, values)
+        solution, square = solve_not_negative(design, values)
+        np.testing.assert_allclose(solution * [1.0, 1e4], expected * [1.0, 1e4], atol=1e-9)
+        assert square == pytest.approx(norm**2)
+        zeros.add(tuple((solution == 0).tolist()))
+    assert len(zeros) == 4
+
+
 def test_models_of_photutils_do_not_mix(sky):
     """Groups are fitted with the model that is asked for, not with that of another field."""
     first = load_model(sky[1])
@@ -395,7 +410,8 @@ def test_derivatives_of_a_grid_are_those_of_its_light(sky):
     grid, step = PsfGrid.sample(load_model(sky[1]), 4, 4), 1e-3
     place = np.array([[grid.columns.mean() + 0.3, grid.rows.mean() - 0.4]])
     corner = np.rint(place).astype(int) - 4
-    slopes = grid.slopes(place, corner, 9)[0]
+    light, *slopes = grid.stamps_and_slopes(place, corner, 9)[0]
+    assert (light == grid.stamps(place, corner, 9)[0]).all()
     for slope, move in zip(slopes, step * np.eye(2), strict=True):
         low, high = (grid.stamps(place + s * move, corner, 9)[0] for s in (-1, 1))
         assert slope == pytest.approx(
