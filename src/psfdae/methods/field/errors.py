@@ -85,7 +85,7 @@ def left_out_stars(
     # Weights of pixels as at the end of the fit, lower for pixels of neighbours (eq. 3).
     weight = fitter.pixel_weight(fit.flux, star_images)
     noise = fitter.pixel_variance(fit.flux, star_images)
-    weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
+    weight *= fitter.robust_weight(fit.residual, weight)
     good_weight = weight * fit.good[:, None, None]
     # Splines begin at the splines of the fit, or of other options fitted to all stars.
     if options is None:
@@ -168,14 +168,16 @@ def field_uncertainty(
     jackknife = [replace(fit.model, coefficients=fit.model.coefficients + f) for f in fields]
     # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
     stars = fit.model.images(fit.model.terms(fitter.place), fit.centre, len(fitter.axis))
-    stars = stars * fit.flux[:, None, None]
-    variance = np.maximum(stars, 0.0) / fitter.photons[:, None, None]
-    sigma = np.sqrt(variance + fitter.noise[:, None, None] ** 2)
+    sigma = np.sqrt(fitter.pixel_variance(fit.flux, stars))
     options = replace(fit.options, tolerance=fitter.settings.compared_tolerance)
-    bootstrap = []
+    bootstrap, all_good = [], np.ones_like(fit.good)
     for _ in range(4):
-        images = np.where(fitter.is_valid, stars + sigma * rng.normal(size=stars.shape), 0.0)
-        bootstrap.append(replace(fitter, images=images).fit(options).model)
+        # The fits start at the truth.
+        noise = np.where(fitter.is_valid, sigma * rng.normal(size=stars.shape), 0.0)
+        start = fit._replace(good=all_good, residual=noise)
+        images = np.where(fitter.is_valid, stars, 0.0) + noise
+        noisy_fitter = replace(fitter, images=images * fit.flux[:, None, None])
+        bootstrap.append(noisy_fitter.fit(options, start).model)
     return FieldUncertainty(tuple(bootstrap), tuple(jackknife), excess_scatter(*light))
 
 
