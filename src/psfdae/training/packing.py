@@ -151,7 +151,7 @@ def build_uncalibrated(
         metrics=[],
     )
     # Errors are 0 until they are measured.
-    nodes = noise_nodes(band)
+    nodes = noise_nodes(band, method_fit.knows_field)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     bundle = Bundle(info, arrays, flux_model, ErrorModel.build_uncalibrated(nodes, blank))
     return bundle, model_stars
