@@ -375,18 +375,20 @@ def solve_splines(
 
     projection = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
     # Preconditioner: the terms of a knot are solved together, as they are far from orthogonal.
-    # Knots are treated as independent: the diagonal of RᵀwC, and half of
-    # the diagonal of c ↦ B c + c B, which is 12 inside: with 12 itself, fits of a field took 3.6 %
-    # more iterations.
+    # Knots are treated as independent: the diagonal of RᵀwC, and half of the diagonal of
+    # c ↦ B c + c B, which is 12 inside: with 12 itself, fits of a field took 3.6 % more iterations.
     curvature = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
     pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
     blocks = (curvature.T @ pairs).reshape(-1, shape[0], shape[0])
     blocks += np.eye(shape[0]) * (6 * penalty.ravel() + ridge.reshape(shape[0], -1).T)[:, None, :]
-    inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
+    # Knots last, over which products are then sums of rows.
+    inverse = np.ascontiguousarray(np.linalg.inv(blocks).transpose(1, 2, 0), np.float32)
+    size = (int(np.prod(shape)),) * 2
 
     def precondition(flat: np.ndarray) -> np.ndarray:
         # The terms of each knot by the inverse of its block.
-        return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
+        residual = flat.reshape(shape[0], -1).astype(np.float32)
+        return np.asarray(np.einsum("ijn,jn->in", inverse, residual).ravel(), float)
 
     coefficients, _ = cg(
         LinearOperator(size, matvec=multiply_normal, dtype=float),
