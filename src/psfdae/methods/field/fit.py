@@ -104,7 +104,7 @@ class FitSettings:
 
     rounds: int = 3
     centre_steps: int = 2
-    left_out_steps: int = 5
+    left_out_steps: int = 3
     window_px: float = 1.2
     window_reach_px: float = 1.0
     wide_reach_px: float = 1.5
