@@ -44,7 +44,7 @@ def build_model(
     name: str,
     licence: str,
     largest_mb: float | None = None,
-    estimates: dict[float, tuple[Method, Estimate]] | None = None,
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]] | None = None,
 ) -> StarModel:
     """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
 
@@ -65,7 +65,7 @@ def build_model(
     largest_mb : float, optional
         Size of the arrays, for which a mixture leaves out fine axes.
     estimates : dict, optional
-        Receives the model's method and its estimate of the noisy test stars by noise level λ.
+        Receives the model's method, the noisy test stars and its estimate of them by noise level λ.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def metrics_by_level(
     errors: StarErrors,
     area: float,
     data_range: float,
-    estimates: dict[float, tuple[Method, Estimate]],
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]],
 ) -> list[dict[str, float]]:
     """Measure errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
 
@@ -285,7 +285,7 @@ def metrics_by_level(
     data_range : float
         Range of values of the metrics (`psfdae.methods.metrics.all_metrics`).
     estimates : dict
-        Receives the method and its estimate by λ.
+        Receives the method, the noisy images and its estimate of them by λ.
 
     Returns
     -------
@@ -299,7 +299,7 @@ def metrics_by_level(
             stars.noise.kappa * level,
             method_fit.estimate(images, level, stars.position),
         )
-        estimates[level] = method_fit, estimate
+        estimates[level] = method_fit, images, estimate
         # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(
