@@ -36,18 +36,8 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
         return result, remaining
     reach = 2
     wide_image, is_good = np.pad(result, reach), np.pad(~bad, reach)
-    # Gaussian mean of the good pixels around, Σ w v / Σ w.
-    steps = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
-    total, count, mean, weight_sum = np.zeros((4, len(row)))
-    for down in steps:
-        for across in steps:
-            at = row + reach + down, column + reach + across
-            weight = weights[down + reach, across + reach] * is_good[at]
-            # Sums over the pixels that are down and across by these steps.
-            mean += weight * wide_image[at]
-            weight_sum += weight
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
+    total, count = np.zeros((2, len(row)))
     for axis in (np.array([1, 0]), np.array([0, 1])):
         pixels = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
         values, can_use = [wide_image[at] for at in pixels], [is_good[at] for at in pixels]
@@ -60,9 +50,21 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
         part = np.where(has_cubic, 2.0, has_line * 1.0)
         total += part * np.where(has_cubic, cubic, line)
         count += part
-    mean = mean / np.where(weight_sum > 0, weight_sum, 1.0)
-    # A pixel without a good pair on either axis gets the Gaussian mean.
-    result[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
+    result[row, column] = total / np.maximum(count, 1.0)
+    # A pixel without a good pair on either axis gets the Gaussian mean of the good pixels around,
+    # Σ w v / Σ w.
+    row, column = row[count == 0], column[count == 0]
+    mean, weight_sum = np.zeros((2, len(row)))
+    steps = np.arange(-reach, reach + 1)
+    weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
+    for down in steps:
+        for across in steps:
+            at = row + reach + down, column + reach + across
+            weight = weights[down + reach, across + reach] * is_good[at]
+            # Sums over the pixels that are down and across by these steps.
+            mean += weight * wide_image[at]
+            weight_sum += weight
+    result[row, column] = mean / np.where(weight_sum > 0, weight_sum, 1.0)
     remaining[row, column] = weight_sum <= 0
     return result, remaining
 
