@@ -151,13 +151,13 @@ class StarErrors:
         median = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - median[:, None]), axis=1)
         excess = (self.outlier_score - median[:, None]) / np.maximum(spread, 1e-12)[:, None]
-        limit = median + spread * np.quantile(excess, 0.999)
+        limit = median + spread * np.quantile(excess, 0.999, method="weibull")
         return np.asarray(np.maximum(limit, np.square(few_star_limit)))
 
     def distance_limit(self) -> float:
         """Return the distance that 0.1 % of the stars exceed."""
         # A distance has the noise of its star in its unit: all nodes are used together.
-        quantile = float(np.quantile(self.distance, 0.999))
+        quantile = float(np.quantile(self.distance, 0.999, method="weibull"))
         return max(quantile, float(self._few_star_limit(self.distance).max()))
 
     def _few_star_limit(self, distance: np.ndarray) -> np.ndarray:
