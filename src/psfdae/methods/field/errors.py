@@ -157,8 +157,11 @@ def field_uncertainty(
     the field (parametric bootstrap: Efron & Tibshirani 1993, An Introduction to the Bootstrap,
     ch. 6.5). Light that the model does not contain appears as sky in left-out stars.
     """
-    # Light that is mistaken for sky in left-out stars, and its σ.
-    parts = list(left_out_stars(fitter, fit))
+    # Light that is mistaken for sky in left-out stars, and its σ. Only differences of fields are
+    # used, which need less accuracy than the field.
+    settings = fitter.settings
+    less_accurate = replace(fit.options, tolerance=settings.early_tolerance)
+    parts = list(left_out_stars(fitter, fit._replace(options=less_accurate)))
     light = np.concatenate([part.light for part in parts], axis=1)
     # Delete-group jackknife (Kott 2001, J. Off. Stat. 17, 521): without each of K folds in turn,
     # fields scatter by 1/√(K − 1) of their error. The scatter is larger where a fit of p terms
@@ -170,7 +173,7 @@ def field_uncertainty(
     # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
     stars = fit.model.images(fit.model.terms(fitter.place), fit.centre, len(fitter.axis))
     sigma = np.sqrt(fitter.pixel_variance(fit.flux, stars))
-    options = replace(fit.options, tolerance=fitter.settings.compared_tolerance)
+    options = replace(fit.options, tolerance=settings.compared_tolerance)
     bootstrap, all_good = [], np.ones_like(fit.good)
     for _ in range(4):
         # The fits start at the truth.
