@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -294,11 +294,8 @@ def metrics_by_level(
     """
     # Coverage is measured crosswise: on stars by the errors that the other stars show.
     rows, measure_coverage = [], cross_validate_coverage(errors)
-    for level, images in noisy:
-        noise, estimate = (
-            stars.noise.kappa * level,
-            method_fit.estimate(images, level, stars.position),
-        )
+    for level, images, estimate in estimate_levels(method_fit, noisy, stars.position):
+        noise = stars.noise.kappa * level
         estimates[level] = method_fit, images, estimate
         # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
@@ -314,6 +311,29 @@ def metrics_by_level(
             }
         )
     return rows
+
+
+def estimate_levels(
+    method_fit: Method, noisy: Iterable[tuple[float, np.ndarray]], position: np.ndarray
+) -> Iterator[tuple[float, np.ndarray, Estimate]]:
+    """Yield each noise level λ, its noisy images of all stars, and the estimate of a method.
+
+    Parameters are as for `metrics_by_level`, and `position` (n, 2) or (n, 4) of its stars.
+    """
+    if not method_fit.knows_field:
+        for level, images in noisy:
+            yield level, images, method_fit.estimate(images, level, position)
+        return
+    # Each node of a field model takes a time that does not depend on the number of stars: the test
+    # stars of an image, which are few, are estimated at all levels together.
+    levels, stacks = zip(*noisy, strict=True)
+    star_level, repeated_position = (
+        np.repeat(levels, len(position)),
+        np.tile(position, (len(levels), 1)),
+    )
+    estimate = method_fit.estimate(np.concatenate(stacks), star_level, repeated_position)
+    parts = estimate.split(len(position))
+    yield from zip(levels, stacks, parts, strict=True)
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:
