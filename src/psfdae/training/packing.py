@@ -75,6 +75,26 @@ def build_model(
     bundle, model_stars = build_uncalibrated(
         method_fit, stars, reference, config, training_config, name, licence, largest_mb
     )
+    return calibrate_model(bundle, method_fit, stars, model_stars, config, estimates)
+
+
+def calibrate_model(
+    bundle: Bundle,
+    method_fit: Method,
+    stars: Product,
+    model_stars: ModelStars,
+    config: OfTest,
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]] | None = None,
+) -> StarModel:
+    """Return the model of a bundle with its errors on test stars.
+
+    Parameters
+    ----------
+    bundle, model_stars
+        Results of `build_uncalibrated`.
+    method_fit, stars, config, estimates
+        As for `build_model`.
+    """
     # Errors are measured with the arrays as the bundle stores them.
     model = StarModel(bundle, estimator(bundle))
     errors, star_errors = calibrate_errors(model, method_fit, model_stars, config.seed)
