@@ -98,6 +98,7 @@ def left_out_stars(
         fitter.advance(1)
     spacing = compute_spacing(len(fitter.axis), options.knots)
     fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
+    preconditioners: list[np.ndarray] = []
     # Errors are computed in the stamps that a model restores.
     axis = fitter.axis[fitter.in_stamp]
     box = np.ix_(np.arange(len(terms)), fitter.in_stamp, fitter.in_stamp)
@@ -108,7 +109,7 @@ def left_out_stars(
         # Splines without the stars of this fold.
         fold_weight = good_weight * (fold != left_out)[:, None, None]
         fold_coefficients = fitter.fit_splines(
-            options, terms, data, fold_weight, fit.centre, coefficients
+            options, terms, data, fold_weight, fit.centre, coefficients, preconditioners
         )
         images, is_valid = data[box][rows], fitter.is_valid[box][rows].astype(float)
         splines = np.tensordot(terms[rows], fold_coefficients, 1)

@@ -393,6 +393,7 @@ class FieldFitter:
         weight: np.ndarray,
         centre: np.ndarray,
         start: np.ndarray | None,
+        preconditioners: list[np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return coefficients (K, N, N) of weighted least squares at given centres (eq. 2, 5).
 
@@ -408,6 +409,8 @@ class FieldFitter:
             Centres (row, column) from the middle pixel.
         start : ndarray, shape (K, N, N), or None
             Coefficients of the previous round.
+        preconditioners : list of ndarray, optional
+            See `solve_splines`.
         """
         # Stars without a pixel of positive weight do not contribute.
         has_weight = weight.any(axis=(1, 2))
@@ -441,6 +444,14 @@ class FieldFitter:
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(
-            terms, data, weight, (rows, columns), penalty, ridge, start, options.tolerance
+            terms,
+            data,
+            weight,
+            (rows, columns),
+            penalty,
+            ridge,
+            start,
+            options.tolerance,
+            preconditioners,
         )
         return change + prior_coefficients
