@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ def left_out_stars(
     # Weights of pixels as at the end of the fit, lower for pixels of neighbours (eq. 3).
     weight = fitter.pixel_weight(fit.flux, star_images)
     noise = fitter.pixel_variance(fit.flux, star_images)
-    weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
+    weight *= fitter.robust_weight(fit.residual, weight)
     good_weight = weight * fit.good[:, None, None]
     # Splines begin at the splines of the fit, or of other options fitted to all stars.
     if options is None:
@@ -97,6 +98,7 @@ def left_out_stars(
         fitter.advance(1)
     spacing = compute_spacing(len(fitter.axis), options.knots)
     fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
+    preconditioners: list[np.ndarray] = []
     # Errors are computed in the stamps that a model restores.
     axis = fitter.axis[fitter.in_stamp]
     box = np.ix_(np.arange(len(terms)), fitter.in_stamp, fitter.in_stamp)
@@ -107,7 +109,7 @@ def left_out_stars(
         # Splines without the stars of this fold.
         fold_weight = good_weight * (fold != left_out)[:, None, None]
         fold_coefficients = fitter.fit_splines(
-            options, terms, data, fold_weight, fit.centre, coefficients
+            options, terms, data, fold_weight, fit.centre, coefficients, preconditioners
         )
         images, is_valid = data[box][rows], fitter.is_valid[box][rows].astype(float)
         splines = np.tensordot(terms[rows], fold_coefficients, 1)
@@ -156,8 +158,11 @@ def field_uncertainty(
     the field (parametric bootstrap: Efron & Tibshirani 1993, An Introduction to the Bootstrap,
     ch. 6.5). Light that the model does not contain appears as sky in left-out stars.
     """
-    # Light that is mistaken for sky in left-out stars, and its σ.
-    parts = list(left_out_stars(fitter, fit))
+    # Light that is mistaken for sky in left-out stars, and its σ. Only differences of fields are
+    # used, which need less accuracy than the field.
+    settings = fitter.settings
+    less_accurate = replace(fit.options, tolerance=settings.early_tolerance)
+    parts = list(left_out_stars(fitter, fit._replace(options=less_accurate)))
     light = np.concatenate([part.light for part in parts], axis=1)
     # Delete-group jackknife (Kott 2001, J. Off. Stat. 17, 521): without each of K folds in turn,
     # fields scatter by 1/√(K − 1) of their error. The scatter is larger where a fit of p terms
@@ -168,14 +173,16 @@ def field_uncertainty(
     jackknife = [replace(fit.model, coefficients=fit.model.coefficients + f) for f in fields]
     # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
     stars = fit.model.images(fit.model.terms(fitter.place), fit.centre, len(fitter.axis))
-    stars = stars * fit.flux[:, None, None]
-    variance = np.maximum(stars, 0.0) / fitter.photons[:, None, None]
-    sigma = np.sqrt(variance + fitter.noise[:, None, None] ** 2)
-    options = replace(fit.options, tolerance=fitter.settings.compared_tolerance)
-    bootstrap = []
+    sigma = np.sqrt(fitter.pixel_variance(fit.flux, stars))
+    options = replace(fit.options, tolerance=settings.compared_tolerance)
+    bootstrap, all_good = [], np.ones_like(fit.good)
     for _ in range(4):
-        images = np.where(fitter.is_valid, stars + sigma * rng.normal(size=stars.shape), 0.0)
-        bootstrap.append(replace(fitter, images=images).fit(options).model)
+        # The fits start at the truth.
+        noise = np.where(fitter.is_valid, sigma * rng.normal(size=stars.shape), 0.0)
+        start = fit._replace(good=all_good, residual=noise)
+        images = np.where(fitter.is_valid, stars, 0.0) + noise
+        noisy_fitter = replace(fitter, images=images * fit.flux[:, None, None])
+        bootstrap.append(noisy_fitter.fit(options, start).model)
     return FieldUncertainty(tuple(bootstrap), tuple(jackknife), excess_scatter(*light))
 
 
@@ -185,7 +192,6 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
     It solves Σ (e²/(σ² + τ²) − 1) / (σ² + τ²) = 0, where e² ≤ 9 (σ² + τ²) limits outliers. The
     result is 0 for fewer than five values.
     """
-    from scipy.optimize import brentq
 
     def slope(scatter: float) -> float:
         # Derivative of ln likelihood with respect to τ², with outliers cut at 3 σ.
@@ -194,9 +200,30 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
 
     if len(values) < 5 or slope(0.0) <= 0:
         return 0.0
-    # Above three times the largest value, the slope is negative.
-    upper_end = 3.0 * float(np.abs(values).max())
-    return float(brentq(slope, 0.0, upper_end))
+    # Above three times the largest value, the slope is negative. 50 bisections find its zero to the
+    # precision of numbers; `scipy.optimize` takes longer to be imported.
+    low, high = 0.0, 3.0 * float(np.abs(values).max())
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if slope(middle) > 0 else (low, middle)
+    return 0.5 * (low + high)
+
+
+def solve_non_negative(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the least-squares coefficients ≥ 0, (K,), of few terms (n, K) for values (n,).
+
+    Terms whose coefficients are 0 can be left out: of all subsets of the terms whose own solution
+    is not negative, the one with the smallest residual is the solution.
+    """
+    solution, least_square = np.zeros(terms.shape[1]), float(values @ values)
+    for is_used in product((False, True), repeat=terms.shape[1]):
+        used_terms = terms[:, list(is_used)]
+        coefficients = np.linalg.lstsq(used_terms, values, rcond=None)[0]
+        square = float(np.square(values - used_terms @ coefficients).sum())
+        if square < least_square and (coefficients >= 0).all():
+            solution, least_square = np.zeros(len(is_used)), square
+            solution[list(is_used)] = coefficients
+    return solution
 
 
 def draw_field_stars(
@@ -268,8 +295,6 @@ def flux_error_over_field(
         distances u and w from the middle along x and y: towards the edge of the field, fewer stars
         determine the PSF. They are 1, 0, 0, 0 for a fit that was read from a file.
     """
-    from scipy.optimize import nnls
-
     # 5 × 5 positions over the field; magnitude and colour are in the middle of their range.
     axes = np.linspace(model.low[:2], model.high[:2], 5).T
     place = np.full((25, 4), np.nan)
@@ -301,5 +326,5 @@ def flux_error_over_field(
     u2, w2 = np.square(place[:, :2] - middle).T
     unit = np.maximum(np.square(axes[:, -1] - middle), 1e-6)
     terms = np.stack([np.ones(25), u2 / unit[0], w2 / unit[1], u2 * w2 / unit.prod()], axis=1)
-    growth = nnls(terms, total / mean)[0] / [1.0, *unit, unit.prod()]
+    growth = solve_non_negative(terms, total / mean) / [1.0, *unit, unit.prod()]
     return float(np.sqrt(mean)), middle, growth

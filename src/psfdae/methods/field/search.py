@@ -76,14 +76,15 @@ def fit_field(
         determined_orders = [o for o in usable_orders if 3 * (o + 1) * (o + 2) <= 4 * len(stars)]
         usable_orders = determined_orders or usable_orders[:1]
     options = FitOptions(count_knots(frame_px, spacing), smoothness, usable_orders[0])
+    start: FieldFit | None = None
     # Largest number of fits: one for the search, ten for knots and smoothness, all orders, three
     # for magnitude and colour, the final one and four for the uncertainty.
     with task("field", 11 + len(usable_orders) + 3 + 5) as advance:
         fitter = replace(fitter, advance=advance)
         if len(orders) > 1 and len(stars) >= 3:
             first_spacing = choose_spacing(stars, spacing)
-            options = _search_options(fitter, options, usable_orders, first_spacing)
-        fit = fitter.fit(options)
+            options, start = _search_options(fitter, options, usable_orders, first_spacing)
+        fit = fitter.fit(options, start)
         # Two stars are too few to leave one out.
         if rng is None or len(stars) < 3:
             return fit
@@ -151,13 +152,13 @@ class CrossValidation:
     def is_better(self, options: FitOptions, reference: FitOptions, factor: float = 1.0) -> bool:
         """Return True if the squared errors are smaller than with the reference, times a factor.
 
-        The comparison ends after as many folds as show the difference at 4 σ.
+        The comparison ends after as many folds as show the difference at 3 σ.
         """
         gain = np.empty(0)
         for fold in range(self.fitter.settings.folds):
             errors, reference_errors = (self._fold_errors(o, fold) for o in (options, reference))
             gain = np.append(gain, reference_errors - errors + np.log(factor))
-            if len(gain) >= 20 and abs(gain.mean()) > 4.0 * gain.std() / np.sqrt(len(gain)):
+            if len(gain) >= 20 and abs(gain.mean()) > 3.0 * gain.std() / np.sqrt(len(gain)):
                 break
         return bool(gain.mean() > 0)
 
@@ -186,8 +187,8 @@ class CrossValidation:
 
 def _search_options(
     fitter: FieldFitter, options: FitOptions, orders: Sequence[int], first_spacing: float
-) -> FitOptions:
-    """Return the options with which left-out stars are predicted best.
+) -> tuple[FitOptions, FieldFit]:
+    """Search the options with which left-out stars are predicted best.
 
     Parameters
     ----------
@@ -199,6 +200,13 @@ def _search_options(
         Orders of the polynomial, ascending.
     first_spacing : float
         Distance of knots at which the search begins.
+
+    Returns
+    -------
+    options : FitOptions
+        The best options.
+    fit : FieldFit
+        Fit at whose fluxes and centres they were compared.
     """
     final_tolerance, finest = options.tolerance, options
     # Splines first, with a polynomial that follows most of the field: with splines that follow
@@ -230,8 +238,8 @@ def _search_options(
     # A field that follows magnitude or colour may need finer splines than one that does not.
     if options.star_terms:
         options = replace(options, knots=finest.knots, smoothness=finest.smoothness)
-        _, options = _search_splines(fitter, options, first_spacing)
-    return replace(options, tolerance=final_tolerance)
+        validation, options = _search_splines(fitter, options, first_spacing)
+    return replace(options, tolerance=final_tolerance), validation.fit
 
 
 def _search_splines(
