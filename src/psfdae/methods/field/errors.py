@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -192,6 +191,7 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
     It solves Σ (e²/(σ² + τ²) − 1) / (σ² + τ²) = 0, where e² ≤ 9 (σ² + τ²) limits outliers. The
     result is 0 for fewer than five values.
     """
+    from scipy.optimize import brentq
 
     def slope(scatter: float) -> float:
         # Derivative of ln likelihood with respect to τ², with outliers cut at 3 σ.
@@ -200,30 +200,9 @@ def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
 
     if len(values) < 5 or slope(0.0) <= 0:
         return 0.0
-    # Above three times the largest value, the slope is negative. 50 bisections find its zero to the
-    # precision of numbers; `scipy.optimize` takes longer to be imported.
-    low, high = 0.0, 3.0 * float(np.abs(values).max())
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if slope(middle) > 0 else (low, middle)
-    return 0.5 * (low + high)
-
-
-def solve_non_negative(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the least-squares coefficients ≥ 0, (K,), of few terms (n, K) for values (n,).
-
-    Terms whose coefficients are 0 can be left out: of all subsets of the terms whose own solution
-    is not negative, the one with the smallest residual is the solution.
-    """
-    solution, least_square = np.zeros(terms.shape[1]), float(values @ values)
-    for is_used in product((False, True), repeat=terms.shape[1]):
-        used_terms = terms[:, list(is_used)]
-        coefficients = np.linalg.lstsq(used_terms, values, rcond=None)[0]
-        square = float(np.square(values - used_terms @ coefficients).sum())
-        if square < least_square and (coefficients >= 0).all():
-            solution, least_square = np.zeros(len(is_used)), square
-            solution[list(is_used)] = coefficients
-    return solution
+    # Above three times the largest value, the slope is negative.
+    upper_end = 3.0 * float(np.abs(values).max())
+    return float(brentq(slope, 0.0, upper_end))
 
 
 def draw_field_stars(
@@ -295,6 +274,8 @@ def flux_error_over_field(
         distances u and w from the middle along x and y: towards the edge of the field, fewer stars
         determine the PSF. They are 1, 0, 0, 0 for a fit that was read from a file.
     """
+    from scipy.optimize import nnls
+
     # 5 × 5 positions over the field; magnitude and colour are in the middle of their range.
     axes = np.linspace(model.low[:2], model.high[:2], 5).T
     place = np.full((25, 4), np.nan)
@@ -326,5 +307,5 @@ def flux_error_over_field(
     u2, w2 = np.square(place[:, :2] - middle).T
     unit = np.maximum(np.square(axes[:, -1] - middle), 1e-6)
     terms = np.stack([np.ones(25), u2 / unit[0], w2 / unit[1], u2 * w2 / unit.prod()], axis=1)
-    growth = solve_non_negative(terms, total / mean) / [1.0, *unit, unit.prod()]
+    growth = nnls(terms, total / mean)[0] / [1.0, *unit, unit.prod()]
     return float(np.sqrt(mean)), middle, growth
