@@ -164,6 +164,8 @@ def photon_transfer(
     Bins of about 60 pixels of equal light have the variance (1.48 median |r/σ|)² ± 2.33/√n of
     itself, and v/σ² − 1 = (L/σ²)/g + ε² L²/σ² is fitted to them; both terms are at least 0.
     """
+    from scipy.optimize import nnls
+
     # Bins of pixels in the order of L/σ²; pixels where it is below 0.02 show no photon noise.
     light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
     light_over_variance = light / sigma**2
@@ -186,26 +188,9 @@ def photon_transfer(
     for _ in range(5):
         weight = np.sqrt(count) / (2.33 * expected_variance)
         design = np.stack([linear, square], axis=1) * weight[:, None]
-        coefficients, residual_square = solve_not_negative(design, (variance - 1.0) * weight)
+        coefficients, residual_norm = nnls(design, (variance - 1.0) * weight)
         expected_variance = 1.0 + coefficients[0] * linear + coefficients[1] * square
     # Standard error of a; where the law does not hold, it is known as badly as χ² says.
-    excess = max(residual_square / (len(bins) - 2), 1.0)
+    excess = max(residual_norm**2 / (len(bins) - 2), 1.0)
     error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])
     return float(coefficients[0]), float(error), float(np.sqrt(coefficients[1]))
-
-
-def solve_not_negative(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the two numbers (2,), none below 0, with the least squares |D x − y|², and these.
-
-    Parameters
-    ----------
-    design, values : ndarray, shape (n, 2) and (n,)
-        D and y.
-    """
-    normal, projection = design.T @ design, design.T @ values
-    solution = np.linalg.solve(normal, projection)
-    if (solution < 0).any():
-        # One of them is 0: y·d/d² of the column d that explains more, or 0 if that is less.
-        alone = np.maximum(projection, 0.0) / np.diag(normal)
-        solution = np.where(np.arange(2) == np.argmax(alone * projection), alone, 0.0)
-    return solution, float(np.square(design @ solution - values).sum())

@@ -14,7 +14,6 @@ from astropy.wcs import WCS
 from photutils.aperture import CircularAperture
 from photutils.psf import PSFPhotometry
 from scipy.ndimage import uniform_filter
-from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
@@ -31,7 +30,7 @@ from psfdae.image.trails import find_saturated_cores
 from psfdae.photometry import crowded, wings_fit
 from psfdae.photometry.crowded import CrowdedPhotometry
 from psfdae.photometry.image_photometry import add_unmeasured_rows
-from psfdae.photometry.photon_noise import add_measured_gain, measure_gain, solve_not_negative
+from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
 from psfdae.photometry.wings_fit import (
     StarFluxes,
     around_stars,
@@ -344,20 +343,6 @@ def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     (weak, _) = measure_gain(model, noisy, noise, good, place) or (np.inf, 0.0)
     assert weak > 4.0
     assert measure_gain(model, noisy, noise, good, place[:9]) is None
-
-
-def test_terms_of_the_photon_noise_are_those_of_nonnegative_least_squares():
-    """Both above 0, one of them 0, or both; the second has the square of the light."""
-    rng, zeros = np.random.default_rng(6), set()
-    for _ in range(60):
-        design = rng.uniform(0.0, 1.0, (20, 2)) * [1.0, 1e4]
-        values = design @ (rng.normal(size=2) * [1.0, 1e-4]) + rng.normal(0.0, 0.3, 20)
-        expected, norm = nnls(design, values)
-        solution, square = solve_not_negative(design, values)
-        np.testing.assert_allclose(solution * [1.0, 1e4], expected * [1.0, 1e4], atol=1e-9)
-        assert square == pytest.approx(norm**2)
-        zeros.add(tuple((solution == 0).tolist()))
-    assert len(zeros) == 4
 
 
 def test_models_of_photutils_do_not_mix(sky):
