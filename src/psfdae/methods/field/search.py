@@ -76,15 +76,14 @@ def fit_field(
         determined_orders = [o for o in usable_orders if 3 * (o + 1) * (o + 2) <= 4 * len(stars)]
         usable_orders = determined_orders or usable_orders[:1]
     options = FitOptions(count_knots(frame_px, spacing), smoothness, usable_orders[0])
-    start: FieldFit | None = None
     # Largest number of fits: one for the search, ten for knots and smoothness, all orders, three
     # for magnitude and colour, the final one and four for the uncertainty.
     with task("field", 11 + len(usable_orders) + 3 + 5) as advance:
         fitter = replace(fitter, advance=advance)
         if len(orders) > 1 and len(stars) >= 3:
             first_spacing = choose_spacing(stars, spacing)
-            options, start = _search_options(fitter, options, usable_orders, first_spacing)
-        fit = fitter.fit(options, start)
+            options = _search_options(fitter, options, usable_orders, first_spacing)
+        fit = fitter.fit(options)
         # Two stars are too few to leave one out.
         if rng is None or len(stars) < 3:
             return fit
@@ -187,8 +186,8 @@ class CrossValidation:
 
 def _search_options(
     fitter: FieldFitter, options: FitOptions, orders: Sequence[int], first_spacing: float
-) -> tuple[FitOptions, FieldFit]:
-    """Search the options with which left-out stars are predicted best.
+) -> FitOptions:
+    """Return the options with which left-out stars are predicted best.
 
     Parameters
     ----------
@@ -200,13 +199,6 @@ def _search_options(
         Orders of the polynomial, ascending.
     first_spacing : float
         Distance of knots at which the search begins.
-
-    Returns
-    -------
-    options : FitOptions
-        The best options.
-    fit : FieldFit
-        Fit at whose fluxes and centres they were compared.
     """
     final_tolerance, finest = options.tolerance, options
     # Splines first, with a polynomial that follows most of the field: with splines that follow
@@ -238,8 +230,8 @@ def _search_options(
     # A field that follows magnitude or colour may need finer splines than one that does not.
     if options.star_terms:
         options = replace(options, knots=finest.knots, smoothness=finest.smoothness)
-        validation, options = _search_splines(fitter, options, first_spacing)
-    return replace(options, tolerance=final_tolerance), validation.fit
+        _, options = _search_splines(fitter, options, first_spacing)
+    return replace(options, tolerance=final_tolerance)
 
 
 def _search_splines(
