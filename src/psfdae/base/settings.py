@@ -44,7 +44,7 @@ CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
 class Group(BaseModel):
     """Group of settings: immutable, and without other keys than it declares."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 Config = Any

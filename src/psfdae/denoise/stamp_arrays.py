@@ -112,6 +112,7 @@ def make_stamps(
         colour=colour,
         listed=_check_columns("centre", centre, count, 2)[:, ::-1],
         noise_correlation=np.ones(count),
+        sky_level=np.full(count, np.nan),
         **star_columns,
     )
     return checked_stamps, unit

@@ -17,7 +17,7 @@ import scipy
 from psfdae.base.types import Header
 from psfdae.image.interpolation import fill_bad
 from psfdae.image.sky_level import SkyLevel, pixel_noise
-from psfdae.stars.moments import robust_scatter
+from psfdae.stars.moments import middle_value, robust_scatter, row_medians
 
 
 @dataclass(frozen=True)
@@ -398,15 +398,21 @@ def find_dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> n
     ndarray of bool, shape (h, w)
         All False for an image with a side below 32 px, too small to have surroundings.
     """
-    around = np.ones((3, 3), dtype=bool)
-    around[1, 1] = False
 
     def find(band: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        # First against the noise of the square, then against the noise of the pixels around.
         clean = fill_bad(band, bad)[0]
-        depth = scipy.ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > 6.0 * noise) & ~bad)
-        deep = depth[row, column] > 6.0 * _measure_noise(clean, noise, row, column)
+        # Few pixels are that far below both neighbours in their row: the eight are compared there.
+        wide_band = np.pad(clean, ((0, 0), (1, 1)), mode="edge")
+        is_low = np.minimum(wide_band[:, :-2], wide_band[:, 2:]) - clean > 6.0 * noise
+        row, column = np.nonzero(is_low & ~bad)
+        depth = np.empty(len(row), clean.dtype)
+        for part, threes in _cut_windows(clean, row, column, 1):
+            neighbours = np.delete(threes.reshape(-1, 9), 4, axis=1)
+            depth[part] = neighbours.min(axis=1) - threes[:, 1, 1]
+        # First against the noise of the square, then against the noise of the pixels around.
+        is_deep = depth > 6.0 * noise[row, column]
+        row, column, depth = row[is_deep], column[is_deep], depth[is_deep]
+        deep = depth > 6.0 * _measure_noise(clean, noise, row, column)
         dead = np.zeros(clean.shape, dtype=bool)
         dead[row[deep], column[deep]] = True
         return dead
@@ -470,35 +476,53 @@ def find_cosmic_rays_in_band(
     # Cosmic rays are not searched for next to a bad pixel, or at the edge of a saturated star.
     clean = fill_bad(band, bad)[0]
     forbidden = scipy.ndimage.binary_dilation(bad)
-    if saturate is not None:
+    if saturate is not None and (is_full := band >= saturate).any():
         # Pixels in and around areas of four saturated pixels or more.
-        label, _ = scipy.ndimage.label(band >= saturate, np.ones((3, 3)))
+        label, _ = scipy.ndimage.label(is_full, np.ones((3, 3)))
         large = np.bincount(label.ravel()) >= 4
         large[0] = False
         forbidden |= scipy.ndimage.binary_dilation(large[label], np.ones((3, 3)), 2)
     cosmic = np.zeros(band.shape, dtype=bool)
+    # L⁺ is nowhere below 0, and neither is its median: where L⁺ is below the limit, so is L⁺ less
+    # its median.
+    edge = compute_edges(clean)
+    row, column = np.nonzero((edge > 3.0 * noise) & ~forbidden)
     # Tracks are found from their ends inwards: found pixels are replaced, and the search repeats
     # where pixels of the windows about a pixel changed.
-    is_changed: np.ndarray | bool = True
     for _ in range(8):
-        # L⁺ of all pixels. It is nowhere below 0, and neither is its median: where L⁺ is below the
-        # limit, so is L⁺ less its median.
-        edge = compute_edges(clean)
-        can_be_new = ~(forbidden | cosmic) & is_changed
-        row, column = np.nonzero((edge > 6.0 * noise) & can_be_new)
-        new = np.zeros_like(cosmic)
-        is_sharp = exceeds_limit(clean, edge, noise, row, column, ratio)
-        new[row[is_sharp], column[is_sharp]] = True
+        is_new = edge[row, column] > 6.0 * noise[row, column]
+        at = row[is_new], column[is_new]
+        is_new[is_new] = exceeds_limit(clean, edge, noise, *at, ratio)
         # Next to a cosmic ray, half the height is enough for both.
-        is_beside = scipy.ndimage.binary_dilation(new, np.ones((3, 3)))
-        row, column = np.nonzero((edge > 3.0 * noise) & can_be_new & is_beside & ~new)
-        is_sharp = exceeds_limit(clean, edge, noise, row, column, ratio, part=0.5)
-        new[row[is_sharp], column[is_sharp]] = True
-        if not new.any():
+        new = np.zeros_like(cosmic)
+        new[row[is_new], column[is_new]] = True
+        is_beside = ~is_new
+        for part, threes in _cut_windows(new, row, column, 1):
+            is_beside[part] &= threes.any(axis=(1, 2))
+        at = row[is_beside], column[is_beside]
+        is_new[is_beside] = exceeds_limit(clean, edge, noise, *at, ratio, part=0.5)
+        if not is_new.any():
             break
-        cosmic |= new
+        row, column = row[is_new], column[is_new]
+        cosmic[row, column] = True
         clean = fill_bad(clean, cosmic | bad)[0]
-        is_changed = scipy.ndimage.maximum_filter(new, 15)
+        # Pixels within 7 px of these: their L⁺ anew, and which of them may be cosmic rays.
+        is_changed = np.zeros_like(cosmic)
+        rows, columns = (
+            np.clip(at[:, None] + np.arange(-7, 8), 0, size - 1)
+            for at, size in zip((row, column), band.shape, strict=True)
+        )
+        is_changed[rows[:, :, None], columns[:, None]] = True
+        row, column = np.nonzero(is_changed)
+        for part, threes in _cut_windows(clean, row, column, 1):
+            edge[row[part], column[part]] = mean_quarters(
+                threes[:, 1, 1],
+                (threes[:, 0, 1], threes[:, 2, 1]),
+                (threes[:, 1, 0], threes[:, 1, 2]),
+            )
+        row, column = np.nonzero(is_changed & ~(forbidden | cosmic))
+        is_high = edge[row, column] > 3.0 * noise[row, column]
+        row, column = row[is_high], column[is_high]
     return cosmic
 
 
@@ -561,10 +585,13 @@ def measure_sharpness(
         clean = fill_bad(image[rows], hidden)[0]
         edge = compute_edges(clean)
         # Local maxima, so bright that noise does not matter, and not saturated.
-        above = clean - np.median(clean)
+        above = clean - middle_value(clean.ravel())
         top = (clean == scipy.ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
-        top &= (scipy.ndimage.maximum_filter(clean, 5) < full) & ~hidden
-        row, column = np.nonzero(top)
+        row, column = np.nonzero(top & ~hidden)
+        is_usable = np.empty(len(row), dtype=bool)
+        for part, fives in _cut_windows(clean, row, column, 2):
+            is_usable[part] = fives.max(axis=(1, 2)) < full
+        row, column = row[is_usable], column[is_usable]
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         row, column = row[brightest], column[brightest]
         # Ratio L⁺/F of each; F is at least the noise, so that flat surroundings are not taken for
@@ -583,12 +610,22 @@ def compute_edges(image: np.ndarray) -> np.ndarray:
     quarters, each cut off at 0.
     """
     wide_image = np.pad(image, 1, mode="edge")
+    middle = np.s_[1:-1]
+    return mean_quarters(
+        image,
+        (wide_image[:-2, middle], wide_image[2:, middle]),
+        (wide_image[middle, :-2], wide_image[middle, 2:]),
+    )
+
+
+def mean_quarters(
+    pixel: np.ndarray,
+    vertical: tuple[np.ndarray, np.ndarray],
+    horizontal: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Return L⁺ of pixels (…) from their two neighbours along a column and along a row."""
     # 2 x − a − b of the neighbours a above or below and b on the left or right, ≥ 0.
-    quarters = [
-        np.maximum(2.0 * image - vertical - horizontal, 0.0)
-        for vertical in (wide_image[:-2, 1:-1], wide_image[2:, 1:-1])
-        for horizontal in (wide_image[1:-1, :-2], wide_image[1:-1, 2:])
-    ]
+    quarters = [np.maximum(2.0 * pixel - a - b, 0.0) for a in vertical for b in horizontal]
     return np.asarray(sum(quarters) / 8.0)
 
 
@@ -599,7 +636,7 @@ def _measure_height(edge: np.ndarray, row: np.ndarray, column: np.ndarray) -> np
     """
     height = np.empty(len(row))
     for part, fives in _cut_windows(edge, row, column, 2):
-        height[part] = fives[:, 2, 2] - np.median(fives.reshape(-1, 25), axis=1)
+        height[part] = fives[:, 2, 2] - row_medians(fives.reshape(-1, 25))
     return height
 
 
@@ -613,8 +650,8 @@ def _measure_structure(image: np.ndarray, row: np.ndarray, column: np.ndarray) -
         # Medians over 3 × 3 pixels at the 7 × 7 positions about the pixel; the one in the middle
         # is its own.
         threes = np.lib.stride_tricks.sliding_window_view(nines, (3, 3), axis=(1, 2))
-        medians = np.median(threes.reshape(-1, 7, 7, 9), axis=3)
-        structure[part] = medians[:, 3, 3] - np.median(medians.reshape(-1, 49), axis=1)
+        medians = row_medians(threes.reshape(-1, 9)).reshape(-1, 7, 7)
+        structure[part] = medians[:, 3, 3] - row_medians(medians.reshape(-1, 49))
     return structure
 
 
@@ -629,7 +666,7 @@ def _measure_noise(
     scatter = np.empty(len(row))
     for part, nines in _cut_windows(image, row, column, 4):
         difference = np.abs(np.diff(nines, axis=2)).reshape(-1, 72)
-        scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
+        scatter[part] = 1.4826 / np.sqrt(2.0) * row_medians(difference)
     return np.asarray(np.maximum(scatter, noise[row, column]))
 
 

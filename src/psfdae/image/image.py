@@ -253,12 +253,17 @@ class Image(Observation):
             sigma = self.noise_map.sigma(cut_image(noise, *window)[0], light) / self.unit_factor
             stamp_sigma = np.ma.array(sigma, mask=is_masked)[stamp]
             sky_noise = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
+            sky_level = np.full(len(data), np.nan)
         else:
             # Noise within the stamp of a bright star would include residuals of the PSF.
-            _, sky_noise = sky_around(data, is_masked | ~np.isfinite(data), stamp_px)
+            sky_level, sky_noise = sky_around(data, is_masked | ~np.isfinite(data), stamp_px)
             sky_noise = np.where(sky_noise > 0, np.maximum(sky_noise, self.least_noise), np.nan)
+        # The level is used where it was measured in the pixels of the stamp with its margin.
+        sky_level = np.where(margin == self.margin, sky_level, np.nan)
         centre = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-        stamps = self._build_stamps(part, data[stamp], is_masked[stamp], sky_noise, centre)
+        stamps = self._build_stamps(
+            part, data[stamp], is_masked[stamp], sky_noise, sky_level, centre
+        )
         raise_flag(stamps.flags, StarFlag.TRUNCATED, is_truncated)
         # A cosmic ray within a pixel of the position: the source may not be a star.
         cosmic = cut_image(self.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]

@@ -34,23 +34,21 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
     row, column = np.nonzero(bad)
     if not row.size:
         return result, remaining
-    reach = 2
-    wide_image, is_good = np.pad(result, reach), np.pad(~bad, reach)
-    # Gaussian mean of the good pixels around, Σ w v / Σ w.
-    steps = np.arange(-reach, reach + 1)
-    weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
-    total, count, mean, weight_sum = np.zeros((4, len(row)))
-    for down in steps:
-        for across in steps:
-            at = row + reach + down, column + reach + across
-            weight = weights[down + reach, across + reach] * is_good[at]
-            # Sums over the pixels that are down and across by these steps.
-            mean += weight * wide_image[at]
-            weight_sum += weight
+
+    def look_up(down: int, across: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels off the bad ones by these steps, 0 if bad, and which are good."""
+        at_row, at_column = row + down, column + across
+        is_inside = (at_row >= 0) & (at_row < bad.shape[0])
+        is_inside &= (at_column >= 0) & (at_column < bad.shape[1])
+        at = np.where(is_inside, at_row, 0), np.where(is_inside, at_column, 0)
+        is_good = is_inside & ~bad[at]
+        return np.where(is_good, image[at], 0.0), is_good
+
     # Along columns and along rows: pixels at distances −2, −1, 1, 2 and whether they are good.
-    for axis in (np.array([1, 0]), np.array([0, 1])):
-        pixels = [(row + reach + n * axis[0], column + reach + n * axis[1]) for n in (-2, -1, 1, 2)]
-        values, can_use = [wide_image[at] for at in pixels], [is_good[at] for at in pixels]
+    total, count = np.zeros((2, len(row)))
+    for axis in ((1, 0), (0, 1)):
+        pixels = [look_up(n * axis[0], n * axis[1]) for n in (-2, -1, 1, 2)]
+        values, can_use = zip(*pixels, strict=True)
         has_line = can_use[1] & can_use[2]
         has_cubic = has_line & can_use[0] & can_use[3]
         line = 0.5 * (values[1] + values[2])
@@ -60,9 +58,20 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
         part = np.where(has_cubic, 2.0, has_line * 1.0)
         total += part * np.where(has_cubic, cubic, line)
         count += part
-    mean = mean / np.where(weight_sum > 0, weight_sum, 1.0)
-    # A pixel without a good pair on either axis gets the Gaussian mean.
-    result[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
+    result[row, column] = total / np.maximum(count, 1.0)
+    # A pixel without a good pair on either axis gets the Gaussian mean of the good pixels around,
+    # Σ w v / Σ w.
+    row, column = row[count == 0], column[count == 0]
+    mean, weight_sum = np.zeros((2, len(row)))
+    steps = range(-2, 3)
+    weights = np.exp(-0.5 * np.add.outer(np.square(steps), np.square(steps)))
+    for down in steps:
+        for across in steps:
+            # Sums over the pixels that are down and across by these steps.
+            value, is_good = look_up(down, across)
+            mean += weights[down + 2, across + 2] * value
+            weight_sum += weights[down + 2, across + 2] * is_good
+    result[row, column] = mean / np.where(weight_sum > 0, weight_sum, 1.0)
     remaining[row, column] = weight_sum <= 0
     return result, remaining
 

@@ -295,6 +295,7 @@ class Observation(ABC):
         data: np.ndarray,
         is_masked: np.ndarray,
         noise: np.ndarray,
+        sky_level: np.ndarray,
         centre: np.ndarray,
     ) -> Stamps:
         """Return stamps (n, s, s) of some of the stars, with flags, positions and columns.
@@ -309,6 +310,8 @@ class Observation(ABC):
             Pixels that are ignored; pixels without a number are added here.
         noise : ndarray, shape (n,)
             σ of the sky, NaN where it is to be estimated.
+        sky_level : ndarray, shape (n,)
+            Median of the pixels around the stamp; NaN where it was not measured.
         centre : ndarray, shape (n, 2)
             Centres from the list, row and column from the middle of the central pixel.
         """
@@ -332,6 +335,7 @@ class Observation(ABC):
             x=x,
             y=y,
             noise=noise,
+            sky_level=sky_level,
             noise_correlation=np.full(len(data), self.noise_correlation),
             gain=unknown if self.gain is None else np.full(len(data), self.gain),
             magnitude=unknown,

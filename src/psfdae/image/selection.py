@@ -243,10 +243,11 @@ def measure_stamps(
     observation : Observation
         Image or cube of the stamps.
     """
-    # Sky around each star, and the star above it. The noise is from the noise map if the
-    # observation has one.
-    side = framing.stamp_px
-    level, noise = sky_around(stamps.data, stamps.bad, side)
+    # Sky around each star, unless it was measured when the stamps were cut, and the star above it.
+    # The noise is from the noise map if the observation has one.
+    side, level, noise = framing.stamp_px, stamps.sky_level, np.zeros(len(stamps))
+    if not np.isfinite(level).all():
+        level, noise = sky_around(stamps.data, stamps.bad, side)
     noise = np.maximum(noise, observation.least_noise)
     noise = np.where(np.isfinite(stamps.noise), stamps.noise, noise)
     light = np.where(stamps.bad, 0.0, stamps.data - level[:, None, None])

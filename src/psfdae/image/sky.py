@@ -122,7 +122,9 @@ def subtract_sky(
         scale = float(np.median(noise[~bad] / sigma[~bad]))
         # Bad pixels, for which the map may lack σ, keep the noise of the sky around.
         noise = np.where(np.isfinite(sigma), scale * sigma, noise).astype(np.float32)
-    signal = fill_bad((image - level).astype(np.float32), bad)[0]
+    # In place: of a large image, each copy takes much memory.
+    image = np.subtract(image, level, out=image, casting="same_kind")
+    signal = fill_bad(image.astype(np.float32, copy=False), bad)[0]
     return Sky(signal, level, noise, bad, scale, least_noise, *sky[2:])
 
 

@@ -23,6 +23,7 @@ from psfdae.stars.moments import (
     count_step,
     cubic_splines,
     dither,
+    middle_value,
     remove_dither,
     robust_scatter,
     row_medians,
@@ -315,7 +316,7 @@ def _correlation(values: np.ndarray, rows_apart: int, columns_apart: int) -> flo
     # 2¹⁶ pairs are enough, evenly spread: ρ has the error 0.006.
     step = np.count_nonzero(is_finite) // 2**16 + 1
     a, b = a[is_finite][::step], b[is_finite][::step]
-    plus, minus = (float(np.median(np.abs(v - np.median(v)))) ** 2 for v in (a + b, a - b))
+    plus, minus = (float(middle_value(np.abs(v - middle_value(v)))) ** 2 for v in (a + b, a - b))
     return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
 
 
@@ -603,28 +604,30 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
         np.cumsum(v, axis=0, dtype=np.float64) for v in (np.where(is_good, values, 0.0), is_good)
     )
     light, number = (np.pad(v, ((1, 0), (0, 0))) for v in sums)
-    lines = np.arange(2 * reach_px, height - 2 * reach_px + 1)
-    side = reach_px // 2
+    first_line, end_line, side = 2 * reach_px, height - 2 * reach_px + 1, reach_px // 2
 
-    def jumps(start: int, end: int, at: np.ndarray) -> np.ndarray:
+    def jumps(start: int, end: int, at: slice) -> np.ndarray:
         """Return the mean of each column `start` to `end` px after rows, less the mean before."""
+
+        def means(start: int, end: int) -> np.ndarray:
+            first, last = (np.s_[at.start + px : at.stop + px] for px in (start, end))
+            return np.asarray((light[last] - light[first]) / (number[last] - number[first]))
+
         with np.errstate(all="ignore"):
-            mean_after, mean_before = (
-                (light[b] - light[a]) / (number[b] - number[a])
-                for a, b in ((at + start, at + end), (at - end, at - start))
-            )
-        return np.asarray(mean_after - mean_before)
+            return np.asarray(means(start, end) - means(-end, -start))
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of rows without good pixels
         # Step at each row: median over the columns, and the scatter about it.
-        step_sizes = jumps(0, 3, lines)
+        step_sizes = jumps(0, 3, np.s_[first_line:end_line])
         middle = row_medians(step_sizes)
         spread = 1.4826 * row_medians(np.abs(step_sizes - middle[:, None]))
         # Slope of the level per px: changes within 12 px on both sides, a pixel off the line. Of
         # two signs they are bad rows, not a slope.
-        slope_before = row_medians(jumps(0, side, lines - side - 1))
-        slope_after = row_medians(jumps(0, side, lines + side + 1))
+        slope_before, slope_after = (
+            row_medians(jumps(0, side, np.s_[first_line + px : end_line + px]))
+            for px in (-side - 1, side + 1)
+        )
         smaller = np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
         slope = np.where(slope_before * slope_after > 0, np.sign(slope_before) * smaller, 0.0)
         # Less the slope over 3 px. A difference of means of 3 px scatters by √(2/3) σ of a pixel.
@@ -639,11 +642,11 @@ def _steps_across(values: np.ndarray, is_good: np.ndarray, reach_px: int) -> lis
         # all three distances.
         steps: list[int] = []
         for k in candidates[np.argsort(-np.abs(jump[candidates]))]:
-            line, height_of_step = int(lines[k]), jump[k]
+            line, height_of_step = first_line + int(k), jump[k]
             eighths = [
                 row_medians(part[None])[0] - (start + end) * slope[k]
                 for start, end in ((0, 3), (3, side), (side, reach_px))
-                for part in np.array_split(jumps(start, end, np.array([line]))[0], 8)
+                for part in np.array_split(jumps(start, end, np.s_[line : line + 1])[0], 8)
             ]
             is_same = np.abs(np.array(eighths) - height_of_step) < 0.5 * abs(height_of_step)
             is_new = all(abs(line - step) > reach_px for step in steps)

@@ -72,8 +72,8 @@ class StampCube(Observation):
                     is_masked |= mask.is_bad(self._cut(mask_pixels, part))
                 # Without a noise map the noise is to be estimated, and a position of the list is in
                 # an image that is not given: it says nothing of the centre in the stamp.
-                noise, centre = np.full(len(data), np.nan), np.full((len(data), 2), np.nan)
-                yield self._build_stamps(part, data, is_masked, noise, centre)
+                unknown, centre = np.full(len(data), np.nan), np.full((len(data), 2), np.nan)
+                yield self._build_stamps(part, data, is_masked, unknown, unknown, centre)
 
     def _cut(self, pixels: ImageFile, part: slice) -> np.ndarray:
         """Return stamps (n, s, s) with their margin out of the middle of some planes."""

@@ -37,6 +37,9 @@ class Stamps(Rows):
     flux, background, noise : ndarray, shape (n,)
         Flux inside the stamp, sky level, and RMS of the sky in a pixel; NaN where they are to be
         estimated.
+    sky_level : ndarray, shape (n,)
+        Median of the margin around the stamp (`psfdae.image.sky.sky_around`); NaN where it was not
+        measured.
     noise_correlation : ndarray, shape (n,)
         Ratio of the noise of sums of pixels of the sky to the noise of sums of independent pixels,
         at least 1.
@@ -62,6 +65,7 @@ class Stamps(Rows):
     flux: np.ndarray
     background: np.ndarray
     noise: np.ndarray
+    sky_level: np.ndarray
     noise_correlation: np.ndarray
     gain: np.ndarray
     magnitude: np.ndarray

@@ -123,12 +123,12 @@ def find_spikes(
     spikes, cores = np.zeros(image.shape, dtype=bool), find_saturated_cores(is_saturated)
     if not len(cores):
         return spikes
-    from skimage.transform import warp_polar
-
     snr = smooth_light(image, bad, sky) / sky.noise
     part_px, angles, parts = 8, 720, 32
     reach_px = part_px * parts
-    shape = angles, reach_px
+    # Rows and columns of the pixels of all rays, from the core.
+    turn = 2.0 * np.pi * np.arange(angles)[:, None] / angles
+    rays_at = np.stack([np.sin(turn), np.cos(turn)]) * np.arange(reach_px)
     for x, y, core_px in cores:
         middle = y, x
         first_part = int(2.0 * core_px / part_px) + 1
@@ -136,7 +136,8 @@ def find_spikes(
         if first_part >= parts:
             continue
         # Lower and upper quartiles of the S/N in parts of 8 px of rays, one ray every half degree.
-        rays = warp_polar(snr, middle, radius=reach_px, output_shape=shape, cval=np.nan)
+        at = rays_at + np.array(middle)[:, None, None]
+        rays = scipy.ndimage.map_coordinates(snr, at, order=1, cval=np.nan)
         quartiles = np.percentile(rays.reshape(angles, parts, part_px), [25, 75], axis=2)
         quartiles = quartiles[:, :, first_part:]
         is_outside = ~np.isfinite(quartiles)
@@ -274,16 +275,22 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
     Line
         Least-squares fit to the pixels within 3 px of the line that has most of them.
     """
-    # Number of pixels in strips of 2 px, for lines of all directions.
+    # Number of pixels in strips of 2 px, for lines of all directions: some directions at a time, so
+    # that their numbers stay in the processor's cache.
     line, most_pixels = Line(0.0, 0.0), 0
-    sample = np.s_[:: max(1, len(x) // 5000)]
-    for angle in np.deg2rad(np.arange(0.0, 180.0, 0.5)):
-        across = Line(float(angle), 0.0).across(x[sample], y[sample])
-        smallest = float(across.min())
-        count = np.bincount(((across - smallest) / 2.0).astype(int))
-        if count.max() > most_pixels:
-            most_pixels = int(count.max())
-            line = Line(float(angle), smallest + 2.0 * float(count.argmax()) + 1.0)
+    sample, angles = np.s_[:: max(1, len(x) // 5000)], np.deg2rad(np.arange(0.0, 180.0, 0.5))
+    for part in np.array_split(angles, len(x[sample]) * len(angles) // 2**16 + 1):
+        across = x[sample] * np.sin(part)[:, None] - y[sample] * np.cos(part)[:, None]
+        smallest = across.min(axis=1)
+        strip = ((across - smallest[:, None]) / 2.0).astype(int)
+        size = len(part), int(strip.max()) + 1
+        strip += size[1] * np.arange(size[0])[:, None]
+        count = np.bincount(strip.ravel(), minlength=size[0] * size[1]).reshape(size)
+        best, best_strip = np.unravel_index(count.argmax(), size)
+        if count[best, best_strip] > most_pixels:
+            most_pixels = int(count[best, best_strip])
+            distance_px = float(smallest[best]) + 2.0 * float(best_strip) + 1.0
+            line = Line(float(part[best]), distance_px)
     # Least-squares fit of angle and distance to the pixels near the line, three times.
     for reach_px in (5.0, 3.0, 3.0):
         across, along = line.across(x, y), line.along(x, y)

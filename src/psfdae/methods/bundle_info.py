@@ -34,9 +34,7 @@ def check_layers(kernels: Sequence[int], widths: Sequence[int]) -> None:
 class _Described(BaseModel):
     """Part of the description: immutable, and without unknown keys or infinite numbers."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Architecture(_Described):

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from psfdae.base.errors import Error
 from psfdae.base.files import Column, read_product, write_product
+from psfdae.base.rows import Rows
 from psfdae.base.settings import Config, Evaluation, Group
 from psfdae.methods.bundle_info import BundleInfo
 from psfdae.stars.bright_stars import BrightStars
@@ -112,7 +113,7 @@ class TrainingSet:
 
 
 @dataclass(frozen=True)
-class Measurements:
+class Measurements(Rows):
     """Photometry and astrometry of stars by a method, in the unit of their stamps.
 
     Attributes
@@ -132,7 +133,7 @@ class Measurements:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Rows):
     """PSFs that a method has restored, with their uncertainty and other measurements.
 
     Attributes

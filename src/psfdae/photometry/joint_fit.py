@@ -123,7 +123,7 @@ def fit_stars(
         gain = np.bincount(group, cost - new_cost)
         is_worse, is_poor = ((gain < part * expected_gain)[group] & moving for part in (-0.5, 0.1))
         back = np.flatnonzero(is_worse)
-        fit.move(back, -step[back])
+        fit.take_back(back, step[back])
         damping = np.where(is_poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.cost() if len(back) else new_cost
         # A cluster in whose boxes nothing has changed, and that is not damped, would get the same
@@ -187,8 +187,11 @@ class _Fit:
         self.psfs, self.image, self.bad, self.box_px = psfs, image, bad, box_px
         # The image and 1/σ of its pixels with a border; bad pixels have the weight 0.
         self.border = psfs.side_px + int(np.ceil(2.0 * range_px))
-        self.residual = np.pad(np.where(bad, 0.0, image).astype(np.float32), self.border)
-        weight = np.pad(np.where(bad, 0.0, 1.0 / error).astype(np.float32), self.border)
+        shape = [side_px + 2 * self.border for side_px in image.shape]
+        self.residual, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        self._core = (np.s_[self.border : -self.border],) * 2
+        np.copyto(self.residual[self._core], image, "same_kind", where=~bad)
+        np.divide(1.0, error, out=weight[self._core], where=~bad, casting="same_kind")
         # Stars on the image whose boxes have at least as many pixels as a star has parameters.
         height, width = image.shape
         on_image = np.isfinite(position).all(axis=1)
@@ -216,7 +219,7 @@ class _Fit:
         # Positions that are known beforehand, and their inverse variance; 0 if none are.
         self.prior_position, self.pull = self.start, 0.0
         # A star moves so little that its PSF stays as it is at the start, of these fluxes.
-        self._psf_flux = self.flux.copy()
+        self._mix_psfs()
         self._corner = np.empty((len(self.stars), 2), int)
         self._light = np.empty((len(self.stars), psfs.psf_px, psfs.psf_px), np.float32)
         self._derivatives = np.empty((len(self.stars), self.parameters, box_px, box_px))
@@ -227,7 +230,7 @@ class _Fit:
             self.flux = self.solve_fluxes()
             # Where the PSF changes with the magnitude, these fluxes determine it from now on.
             if self.psfs.magnitudes.size:
-                self._psf_flux = self.flux.copy()
+                self._mix_psfs()
                 self._draw(rows)
         self._subtract(rows, self.flux)
 
@@ -239,20 +242,29 @@ class _Fit:
         row, column = (corner[:, k, None] + np.arange(side_px) + self.border for k in (1, 0))
         return np.asarray(row[:, :, None] * self.residual.shape[1] + column[:, None, :])
 
+    def _mix_psfs(self) -> None:
+        """Mix the PSFs of the stars for their fluxes; PSFs of over 100 MB are mixed as needed."""
+        self._psf_flux, self._splines = self.flux.copy(), None
+        if len(self.stars) * self.psfs.splines[0].nbytes < 100e6:
+            self._splines = self.psfs.mix_splines(self.start, self._psf_flux)
+
     def _draw(self, rows: np.ndarray) -> None:
         """Draw the light of some stars of flux 1, and its derivatives by x and y in their boxes."""
-        # 256 stars at a time: PSFs of all stars would take more memory than the image.
+        # 256 stars at a time, for memory.
         for part in np.array_split(rows, len(rows) // 256 + 1):
             position, box_corner = self.position[part], self._middle[part] - self.box_px // 2
-            splines = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+            if self._splines is None:
+                psfs = self.psfs.mix_splines(self.start[part], self._psf_flux[part])
+                splines = psfs, np.arange(len(part))
+            else:
+                splines = self._splines, part
             self._corner[part] = self.psfs.find_corners(position)
             stamps = position, self._corner[part], self.psfs.psf_px
             self._light[part] = self.psfs.stamps(*stamps, splines=splines)
             # The box stays where it is while the stamp moves with its star: its light is drawn by
             # itself, with its derivatives.
             box = position, box_corner, self.box_px
-            self._derivatives[part, 0] = self.psfs.stamps(*box, splines=splines)
-            self._derivatives[part, 1:] = self.psfs.slopes(*box, splines=splines)
+            self._derivatives[part] = self.psfs.stamps_and_slopes(*box, splines=splines)
 
     def _subtract(self, rows: np.ndarray, flux: np.ndarray) -> None:
         """Subtract the light of some stars with these fluxes from the residuals."""
@@ -270,12 +282,26 @@ class _Fit:
         return self.solve(design, np.zeros(1), np.zeros(len(rows)), rows)[0][:, 0]
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
-        """Change flux, x and y of some stars by (k, 3)."""
+        """Change flux, x and y of some stars, ascending, by (k, 3)."""
+        drawn = self._corner, self._light, self._derivatives
+        self._before_move = rows, [values[rows] for values in drawn]
         # The old light is added to the residuals, and the light at the new position is subtracted.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
         self.position[rows] += change[:, 1:]
         self._draw(rows)
+        self._subtract(rows, self.flux[rows])
+
+    def take_back(self, rows: np.ndarray, change: np.ndarray) -> None:
+        """Take the last change (k, 3) of some of the moved stars back, which are not drawn anew."""
+        self._subtract(rows, -self.flux[rows])
+        self.flux[rows] -= change[:, 0]
+        self.position[rows] -= change[:, 1:]
+        moved_rows, drawn_before = self._before_move
+        at = np.searchsorted(moved_rows, rows)
+        drawn = self._corner, self._light, self._derivatives
+        for values, before in zip(drawn, drawn_before, strict=True):
+            values[rows] = before[at]
         self._subtract(rows, self.flux[rows])
 
     def design(self, rows: np.ndarray) -> np.ndarray:
@@ -351,9 +377,8 @@ class _Fit:
             return column
 
         # The light of all stars is what the image has beyond the residuals.
-        core = np.s_[self.border : -self.border]
         light = np.where(self.bad, 0.0, self.image).astype(np.float32)
-        np.subtract(light, self.residual[core, core], out=light, casting="same_kind")
+        np.subtract(light, self.residual[self._core], out=light, casting="same_kind")
         return JointFit(
             fill_rows(self.position),
             fill_rows(error[:, 1:]),

@@ -74,21 +74,21 @@ def find_stars(
         centre = (middle[:, None] + PHASES_PX).reshape(-1, 2)
         corner, faint = np.repeat(middle - half_px, 4, axis=0), np.zeros(len(centre))
         psf = psfs.stamps(centre, corner, 2 * half_px + 1, flux=faint)
-        # The tiles with a margin of a pixel more than the PSF reaches; σ is infinite off the image.
+        # r/σ and 1/σ of these tiles, (tiles, rows, columns), with a margin of a pixel more than the
+        # PSF reaches. Both are 0 off the image; squares have a number in the unit of the sky.
         first, end = max(top - margin, 0), min(top + tile_px + margin, height)
         pads = (first - top + margin, top + tile_px + margin - end), (margin, margin + tile_px)
         bands = (
-            np.pad(image[first:end], pads, constant_values=outside)
-            for image, outside in ((residual, 0.0), (sigma, np.inf))
+            np.pad(values.astype(np.float32), pads)
+            for values in (residual[first:end] / sigma[first:end], 1.0 / sigma[first:end])
         )
-        # These tiles, (tiles, rows, columns).
         side = tile_px + 2 * margin
-        residual_tiles, sigma_tiles = (
+        deviation, weight = (
             sliding_window_view(band, side, axis=1)[:, ::tile_px].swapaxes(0, 1)[tiles]
             for band in bands
         )
         tile_psfs = psf.reshape(len(columns), 4, *psf.shape[1:])
-        snr, flux = measure_snr(residual_tiles, sigma_tiles, tile_psfs)
+        snr, flux = measure_snr(deviation, weight, tile_psfs)
         # Local maxima among all half pixels of the tile; a pixel more surrounds it.
         tile, row, column = np.nonzero(snr[:, 2:-2, 2:-2] > threshold)
         around = np.ix_([1, 2, 3], [1, 2, 3])
@@ -109,14 +109,14 @@ def find_stars(
 
 
 def measure_snr(
-    residual: np.ndarray, sigma: np.ndarray, psf: np.ndarray
+    deviation: np.ndarray, weight: np.ndarray, psf: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return S over its scatter, and F, at the half pixels of n parts of an image.
 
     Parameters
     ----------
-    residual, sigma : ndarray, shape (n, h, w)
-        As in `find_stars`.
+    deviation, weight : ndarray, shape (n, h, w), float32
+        r/σ and 1/σ, 0 for bad pixels.
     psf : ndarray, shape (n, 4, s, s)
         PSFs of stars at `PHASES_PX` from the middle pixel, s odd.
 
@@ -129,16 +129,17 @@ def measure_snr(
     """
     from scipy import fft
 
-    # r/σ and 1/σ: the squares have a number in the unit of `Observation.sky`.
-    is_used = np.isfinite(sigma)
-    weight, deviation = (1.0 / sigma).astype(np.float32), (residual / sigma).astype(np.float32)
     # Sums over pixels are correlations with the PSF: Σ P r/σ², Σ P²/σ², and Σ P² of the good
     # pixels. Those that reach across the edge to the other side are cut off.
-    *_, height, width = sigma.shape
+    *_, height, width = weight.shape
     size = [fft.next_fast_len(side, real=True) for side in (height, width)]
     inner = np.s_[..., : height + 1 - psf.shape[-1], : width + 1 - psf.shape[-1]]
     square = np.square(psf.astype(np.float32))
-    kernels = [np.conj(fft.rfft2(values, size)) for values in (psf.astype(np.float32), square)]
+    # Rows beyond those of a PSF are 0, and so are their transforms along x.
+    kernels = [
+        np.conj(fft.fft(fft.rfft(values, size[1]), size[0], axis=-2))
+        for values in (psf.astype(np.float32), square)
+    ]
 
     def correlate(values: np.ndarray, kernel: np.ndarray) -> np.ndarray:
         product = fft.rfft2(values.astype(np.float32), size)[:, None] * kernel
@@ -150,6 +151,7 @@ def measure_snr(
     # error makes σ 10³ times as large, nothing can be found.
     is_known = information > 1e-6 * information.max(axis=(1, 2, 3), keepdims=True)
     # Only parts with bad pixels, or at an edge, can lack half of Σ P².
+    is_used = weight > 0
     parts = np.flatnonzero(~is_used.all(axis=(1, 2)))
     if parts.size:
         total = square[parts].sum(axis=(2, 3), keepdims=True)
@@ -166,6 +168,10 @@ def measure_snr(
     snr /= np.where(count > 0, np.maximum(scatter, 1.0), 1.0)[:, None, None, None]
     # The four phases of a pixel are its four half pixels.
     tiles, _, height, width = snr.shape
-    values = np.stack([snr, flux]).reshape(2, tiles, 2, 2, height, width)
-    snr, flux = values.transpose(0, 1, 4, 2, 5, 3).reshape(2, tiles, 2 * height, 2 * width)
+    snr, flux = (
+        values.reshape(tiles, 2, 2, height, width)
+        .transpose(0, 3, 1, 4, 2)
+        .reshape(tiles, 2 * height, 2 * width)
+        for values in (snr, flux)
+    )
     return snr, flux

@@ -19,7 +19,7 @@ from psfdae.image.camera import CameraValue
 from psfdae.image.image import Image
 from psfdae.psf.grid import PsfGrid
 from psfdae.psf.interface import FieldPsfs
-from psfdae.stars.moments import SIGMA_OF_MAD
+from psfdae.stars.moments import SIGMA_OF_MAD, middle_value
 
 
 def pixel_error(noise: np.ndarray, light: np.ndarray, gain: float | None) -> np.ndarray:
@@ -101,9 +101,8 @@ def measure_gain(
         # Columns are the light of a star of flux 1, F ∂/∂x and F ∂/∂y for F = 1, and the sky.
         corner = np.stack([column, row], axis=1) - half
         design = np.ones((len(position), 4, len(axis) ** 2))
-        stars = position, corner, len(axis)
-        design[:, 0] = psfs.stamps(*stars).reshape(len(position), -1)
-        design[:, 1:3] = psfs.slopes(*stars).reshape(len(position), 2, -1)
+        star_light = psfs.stamps_and_slopes(position, corner, len(axis))
+        design[:, :3] = star_light.reshape(len(position), 3, -1)
         design = design.transpose(0, 2, 1)
         variance = sigma**2 + photons * light + (off * light) ** 2
         weighted_design = design / variance[..., None]
@@ -182,7 +181,7 @@ def photon_transfer(
         for values in (light_over_variance, light * light_over_variance)
     )
     modulus = np.abs(residual / sigma)
-    variance = np.array([SIGMA_OF_MAD * np.median(modulus[members]) for members in bins]) ** 2
+    variance = np.array([SIGMA_OF_MAD * middle_value(modulus[members]) for members in bins]) ** 2
     # Weighted least squares of a and b ≥ 0 in v/σ² − 1 = a L/σ² + b L²/σ²; weights follow from the
     # variances that the last fit expects.
     expected_variance = np.maximum(variance, 1.0)

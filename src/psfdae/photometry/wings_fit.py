@@ -100,17 +100,18 @@ def star_bins(
     # Its stamp in the window: pixels less than half a stamp from the star along both axes.
     stamp_first = np.maximum(np.floor(positions - half_px).astype(int) + 1 - first, 0)
     stamp_end = np.maximum(np.ceil(positions + half_px).astype(int) - first, 0)
+    limits = np.concatenate([first, end, stamp_first, stamp_end], axis=1)
     for star in np.flatnonzero((first < end).all(axis=1)).tolist():
-        (x, y), (column, row), (column_end, row_end) = positions[star], first[star], end[star]
-        # Distances of the pixels from the star along either axis, and from its centre.
-        across = (np.arange(column, column_end) - x).astype(np.float32)
-        down = (np.arange(row, row_end) - y).astype(np.float32)
+        # Numbers of Python: sums of an array's elements take longer.
+        x, y = positions[star].tolist()
+        column, row, column_end, row_end, *stamp = limits[star].tolist()
+        # Distances of the pixels from the star along either axis, and from its centre, in bins.
+        across = BINS_PER_PX * (np.arange(column, column_end) - x).astype(np.float32)
+        down = BINS_PER_PX * (np.arange(row, row_end) - y).astype(np.float32)
         distance = np.sqrt(np.square(down)[:, None] + np.square(across))
-        distance *= BINS_PER_PX
         distance += 1.5
         bins = distance.astype(np.int32)
-        (stamp_column, stamp_row), (column_stop, row_stop) = stamp_first[star], stamp_end[star]
-        bins[stamp_row:row_stop, stamp_column:column_stop] = 0
+        bins[stamp[1] : stamp[3], stamp[0] : stamp[2]] = 0
         window = (
             slice(row - rows.start, row_end - rows.start),
             slice(column - columns.start, column_end - columns.start),

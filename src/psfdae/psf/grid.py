@@ -109,6 +109,8 @@ class PsfGrid:
         # A product with a sparse matrix, whose rows have the weights of the nodes.
         ends, size = np.arange(len(node) + 1) * node.shape[1], (len(node), len(self.splines))
         weights = csr_array((share.astype(np.float32).ravel(), node.ravel(), ends), shape=size)
+        # Of a faint or a bright star, whose PSF is that at one magnitude, eight of twelve are 0.
+        weights.eliminate_zeros()
         mean_spline = weights @ self.splines.reshape(len(self.splines), -1)
         return np.asarray(mean_spline.reshape(len(centre), *self.splines.shape[1:]))
 
@@ -136,7 +138,7 @@ class PsfGrid:
         corner: np.ndarray,
         side_px: int,
         flux: np.ndarray | None = None,
-        splines: np.ndarray | None = None,
+        splines: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return the light of stars of flux 1 in stamps of the image.
 
@@ -151,8 +153,9 @@ class PsfGrid:
         flux : ndarray, shape (n,), optional
             Fluxes, counts, by which the PSFs differ if the grid has magnitudes. Where they are NaN
             or not given, the PSF is as at the middle magnitude.
-        splines : ndarray, shape (n, k, k), optional
-            PSFs of the stars, of `mix_splines`, for stars that are drawn several times.
+        splines : tuple of ndarray, shapes (m, k, k) and (n,), optional
+            PSFs of `mix_splines`, and the number of each star's, for stars that are drawn several
+            times.
 
         Returns
         -------
@@ -162,26 +165,28 @@ class PsfGrid:
         stars = centre, corner, side_px, flux, splines
         return self._sum_splines(*stars, with_slopes=False)[:, 0]
 
-    def slopes(
+    def stamps_and_slopes(
         self,
         centre: np.ndarray,
         corner: np.ndarray,
         side_px: int,
-        splines: np.ndarray | None = None,
+        splines: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the derivatives of the light of `stamps` by x and y of the star, per pixel.
+        """Return the light of `stamps`, and its derivatives by x and y of the star, per pixel.
 
         Parameters are as in `stamps`; PSFs are as at the middle magnitude unless splines are given.
         The change of the PSF over the field is left out.
 
         Returns
         -------
-        ndarray, shape (n, 2, side_px, side_px), float32
+        ndarray, shape (n, 3, side_px, side_px), float32
             0 beyond the edge of the PSF.
         """
         stars = centre, corner, side_px, None, splines
+        values = self._sum_splines(*stars, with_slopes=True)
         # A star that moves by a pixel moves by −o knots under its pixels.
-        return -self.oversampling * self._sum_splines(*stars, with_slopes=True)
+        values[:, 1:] *= -self.oversampling
+        return values
 
     def _sum_splines(
         self,
@@ -189,11 +194,11 @@ class PsfGrid:
         corner: np.ndarray,
         side_px: int,
         flux: np.ndarray | None,
-        splines: np.ndarray | None,
+        splines: tuple[np.ndarray, np.ndarray] | None,
         with_slopes: bool,
     ) -> np.ndarray:
-        """Return the light (n, 1, s, s) of stars, or its slopes (n, 2, s, s) along x and y."""
-        values = np.zeros((len(centre), 2 if with_slopes else 1, side_px, side_px), np.float32)
+        """Return the light (n, 1, s, s) of stars; with its slopes along x and y, (n, 3, s, s)."""
+        values = np.zeros((len(centre), 3 if with_slopes else 1, side_px, side_px), np.float32)
         # Position of the first pixel among the knots, along x and y:
         # u = o (pixel − centre) + m//2, with its knot ⌊u⌋ and phase u − ⌊u⌋.
         size, between = self.psfs.shape[-1], self.oversampling
@@ -207,7 +212,8 @@ class PsfGrid:
         (x, y), (x_slope, y_slope) = (
             kernel.astype(np.float32).swapaxes(0, 1) for kernel in knot_weights(first - knot)
         )
-        pairs = [(y, x_slope), (y_slope, x)] if with_slopes else [(y, x)]
+        # Weights along y, each with those along x: for the light, its slope along x, and along y.
+        terms = [(y, [x, x_slope]), (y_slope, [x])] if with_slopes else [(y, [x])]
         # Stamps may reach beyond a PSF: pad its spline with zeros, by no more than they do. Four
         # coefficients from the knot before the first pixel on are its taps.
         begin, span = knot[stars] + 1, between * (side_px - 1) + 4
@@ -219,7 +225,7 @@ class PsfGrid:
                 part = self.mix_splines(centre[batch], None if flux is None else flux[batch])
                 spline = np.arange(len(batch))
             else:
-                part, spline = splines, batch
+                part, spline = splines[0], splines[1][batch]
             if room:
                 part, spline = part[spline], np.arange(len(batch))
                 part = np.pad(part, ((0, 0), (room, room), (room, room)))
@@ -235,13 +241,17 @@ class PsfGrid:
             column, row = knot[batch].T + room + 1
             taps = taps[spline, row, column].reshape(len(batch), 4, side_px * span)
             # Sums over these taps, for all coefficients of a row, and then over those along x.
-            for number, (down_weight, across_weight) in enumerate(pairs):
+            number = 0
+            for down_weight, across_weights in terms:
                 sums = (down_weight[batch, None] @ taps).reshape(-1, side_px, span)
-                values[batch, number] = sum(
-                    across_weight[batch, tap, None, None]
-                    * sums[:, :, tap : tap + span - 3 : between]
-                    for tap in range(4)
-                )
+                columns = [sums[:, :, tap : tap + span - 3 : between] for tap in range(4)]
+                for across_weight in across_weights:
+                    weight = across_weight[batch, :, None, None]
+                    total = weight[:, 0] * columns[0]
+                    for tap in (1, 2, 3):
+                        total += weight[:, tap] * columns[tap]
+                    values[batch, number] = total
+                    number += 1
         values *= (is_inside[:, 1, :, None] & is_inside[:, 0, None, :])[:, None]
         return values
 

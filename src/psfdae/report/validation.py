@@ -16,7 +16,7 @@ from psfdae.denoise.flux_model import signal_to_noise
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.tables import rows_to_table, set_format
 from psfdae.methods import method as method_of
-from psfdae.methods.interface import Estimate, Method
+from psfdae.methods.interface import Method
 from psfdae.methods.metrics import all_metrics, quality, summarise_metrics
 from psfdae.psf.interface import PredictionError
 from psfdae.report.checks import (
@@ -133,15 +133,18 @@ def _measure(model: StarModel, stars: ImageStars, methods: Mapping[str, Method])
     key = {"dataset": stars.name, "split": stars.split_kind, "reference": stars.reference}
     rows, mean_rows, per_star, denoised_images = [], [], [], {}
     for level in steps("stars held out", settings.noise.levels):
-        noisy = noisy_test_images(settings, product, test, level)
+        # The images of the packing, if a model was packed from these stars, and its estimate.
+        packed_method, noisy, packed_estimate = stars.estimates.get(level, (None, None, None))
+        if noisy is None:
+            noisy = noisy_test_images(settings, product, test, level)
         # The centre is fitted up to a pixel beyond the jitter: noise moves the brightest pixel.
         by_mean_psf = fit_mean_psf(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
         mean_rows += summarise_metrics(row, all_metrics(by_mean_psf, truth, data_range), star)
         for name, method in methods.items():
-            # The estimate of the packing, if the model was packed from these stars.
-            packed_method, estimate = stars.estimates.get(level, (None, Estimate(noisy)))
-            if method is not packed_method:
+            if packed_estimate is not None and method is packed_method:
+                estimate = packed_estimate
+            else:
                 scale = level_scale(model, stars, name)
                 estimate = method.estimate(noisy, scale * level, position)
             # Metrics of every image; their means and standard errors are clustered by star.

@@ -129,7 +129,9 @@ def build_stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | No
         noise_correlation=np.ones(count),
         gain=per_star("gain", gain),
         listed=np.full((count, 2), np.nan),
-        **dict.fromkeys(("x", "y", "flux", "background", "magnitude", "colour"), unknown),
+        **dict.fromkeys(
+            ("x", "y", "flux", "background", "sky_level", "magnitude", "colour"), unknown
+        ),
     )
 
 

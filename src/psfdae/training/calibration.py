@@ -80,11 +80,12 @@ class StarErrors:
         """
         # Each star at each node of the noise; all are denoised together. Few stars of an image are
         # drawn several times, half of which are enough for a method that knows the field: the
-        # number of stars limits its half-widths, not the noise. Every star is drawn once at least.
+        # number of stars limits its half-widths, not the noise. Every star is drawn once at least,
+        # as the images of stars come in turn.
         draws = [stars.draw(node, rng) for node in nodes]
         count = len(draws[0][1])
         if method_fit.knows_field:
-            count = max(count // 2, len(stars.images))
+            count = max(count // 2, stars.count_stars())
         draws = [(images[:count], star[:count]) for images, star in draws]
         noisy, star = (np.concatenate(arrays) for arrays in zip(*draws, strict=True))
         noise = np.repeat(nodes, count)
@@ -150,13 +151,13 @@ class StarErrors:
         median = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - median[:, None]), axis=1)
         excess = (self.outlier_score - median[:, None]) / np.maximum(spread, 1e-12)[:, None]
-        limit = median + spread * np.quantile(excess, 0.999)
+        limit = median + spread * np.quantile(excess, 0.999, method="weibull")
         return np.asarray(np.maximum(limit, np.square(few_star_limit)))
 
     def distance_limit(self) -> float:
         """Return the distance that 0.1 % of the stars exceed."""
         # A distance has the noise of its star in its unit: all nodes are used together.
-        quantile = float(np.quantile(self.distance, 0.999))
+        quantile = float(np.quantile(self.distance, 0.999, method="weibull"))
         return max(quantile, float(self._few_star_limit(self.distance).max()))
 
     def _few_star_limit(self, distance: np.ndarray) -> np.ndarray:
@@ -176,13 +177,16 @@ class StarErrors:
         return np.asarray(distance.mean(axis=1) + factor * distance.std(axis=1))
 
 
-def noise_nodes(band: np.ndarray) -> np.ndarray:
+def noise_nodes(band: np.ndarray, gives_sigma: bool) -> np.ndarray:
     """Return the noise levels at which errors are measured, ascending.
 
     They cover the S/N of all stars without a flag, which is wider than the `band` of the training
     by a tolerance: fluxes are estimates, and half of the faintest stars look fainter than they are.
+    Errors in units of a σ that the method gives change less with the noise than errors in units of
+    the flux: three quarters of the nodes are enough.
     """
-    return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, NODES)
+    count = 3 * NODES // 4 if gives_sigma else NODES
+    return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, count)
 
 
 def calibrate_errors(

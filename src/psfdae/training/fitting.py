@@ -22,7 +22,7 @@ from psfdae.methods.interface import Method
 from psfdae.photometry.image_photometry import measure_stars
 from psfdae.photometry.photon_noise import add_measured_gain
 from psfdae.psf.wings import Wings
-from psfdae.training.packing import add_wings, build_model
+from psfdae.training.packing import add_wings, build_uncalibrated, calibrate_model
 from psfdae.training.settings import apply_keywords
 from psfdae.training.star_choice import ENOUGH_STARS
 from psfdae.training.star_sets import field_positions, fit_apart, noise_model
@@ -176,33 +176,35 @@ def pack_model(stars: ImageStars, method_fit: Method, name: str, licence: str) -
     name, licence : str
         Name and licence of the model.
     """
-    # Calibrate the errors of the fit on held-out stars.
-    settings = stars.settings
+    settings, product = stars.settings, stars.product
     description = describe_settings(stars, type(method_fit))
     with fix_threads(settings.evaluation.threads):
-        model = build_model(
-            method_fit,
-            stars.product,
-            ImageStars.reference,
-            settings,
-            description,
-            name,
-            licence,
-            estimates=stars.estimates,
+        bundle, model_stars = build_uncalibrated(
+            method_fit, product, ImageStars.reference, settings, description, name, licence
         )
-        if not method_fit.knows_field:
-            return model
-        # Light outside the stamps, as the photometry of each image with this model measures it:
-        # `flux_total` of a star and its flux by photometry are the same. Stars that are found in
-        # the residuals of the first fit change the wings by up to two of their errors, stars of
-        # later fits by less than a quarter of one: two fits are enough.
-        wings = []
-        for image in stars.images:
-            if not isinstance(image.observation, Image):
-                continue
-            observation = add_measured_gain(model, image.observation.assume_scale())
-            photometry, _ = measure_stars(model, observation, image.source.given_threshold, 2)
-            wings += [] if photometry.image_wings is None else [photometry.image_wings]
+        # The wings, which do not depend on the errors of the fit, come first: the nodes of the fit
+        # and maps of a large image together would take more memory.
+        wings = measure_wings(StarModel(bundle), stars) if method_fit.knows_field else []
+        # Calibrate the errors of the fit on held-out stars.
+        model = calibrate_model(bundle, method_fit, product, model_stars, settings, stars.estimates)
     if not wings:
         return model
     return StarModel(add_wings(model.bundle, Wings.join(wings)), model.method)
+
+
+def measure_wings(model: StarModel, stars: ImageStars) -> list[Wings]:
+    """Return the light outside the stamps in each image that shows any.
+
+    It is what the photometry with this model measures: `flux_total` of a star and its flux by
+    photometry are the same.
+    """
+    # Stars that are found in the residuals of the first fit change the wings by up to two of their
+    # errors, stars of later fits by less than a quarter of one: two fits are enough.
+    wings = []
+    for image in stars.images:
+        if not isinstance(image.observation, Image):
+            continue
+        observation = add_measured_gain(model, image.observation.assume_scale())
+        photometry, _ = measure_stars(model, observation, image.source.given_threshold, 2)
+        wings += [] if photometry.image_wings is None else [photometry.image_wings]
+    return wings

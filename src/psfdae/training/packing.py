@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -44,7 +44,7 @@ def build_model(
     name: str,
     licence: str,
     largest_mb: float | None = None,
-    estimates: dict[float, tuple[Method, Estimate]] | None = None,
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]] | None = None,
 ) -> StarModel:
     """Return the model of a fit, with its errors on test stars and all that it takes to apply it.
 
@@ -65,7 +65,7 @@ def build_model(
     largest_mb : float, optional
         Size of the arrays, for which a mixture leaves out fine axes.
     estimates : dict, optional
-        Receives the model's method and its estimate of the noisy test stars by noise level λ.
+        Receives the model's method, the noisy test stars and its estimate of them by noise level λ.
 
     Raises
     ------
@@ -75,6 +75,26 @@ def build_model(
     bundle, model_stars = build_uncalibrated(
         method_fit, stars, reference, config, training_config, name, licence, largest_mb
     )
+    return calibrate_model(bundle, method_fit, stars, model_stars, config, estimates)
+
+
+def calibrate_model(
+    bundle: Bundle,
+    method_fit: Method,
+    stars: Product,
+    model_stars: ModelStars,
+    config: OfTest,
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]] | None = None,
+) -> StarModel:
+    """Return the model of a bundle with its errors on test stars.
+
+    Parameters
+    ----------
+    bundle, model_stars
+        Results of `build_uncalibrated`.
+    method_fit, stars, config, estimates
+        As for `build_model`.
+    """
     # Errors are measured with the arrays as the bundle stores them.
     model = StarModel(bundle, estimator(bundle))
     errors, star_errors = calibrate_errors(model, method_fit, model_stars, config.seed)
@@ -151,7 +171,7 @@ def build_uncalibrated(
         metrics=[],
     )
     # Errors are 0 until they are measured.
-    nodes = noise_nodes(band)
+    nodes = noise_nodes(band, method_fit.knows_field)
     blank = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     bundle = Bundle(info, arrays, flux_model, ErrorModel.build_uncalibrated(nodes, blank))
     return bundle, model_stars
@@ -266,7 +286,7 @@ def metrics_by_level(
     errors: StarErrors,
     area: float,
     data_range: float,
-    estimates: dict[float, tuple[Method, Estimate]],
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]],
 ) -> list[dict[str, float]]:
     """Measure errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
 
@@ -285,7 +305,7 @@ def metrics_by_level(
     data_range : float
         Range of values of the metrics (`psfdae.methods.metrics.all_metrics`).
     estimates : dict
-        Receives the method and its estimate by λ.
+        Receives the method, the noisy images and its estimate of them by λ.
 
     Returns
     -------
@@ -294,12 +314,9 @@ def metrics_by_level(
     """
     # Coverage is measured crosswise: on stars by the errors that the other stars show.
     rows, measure_coverage = [], cross_validate_coverage(errors)
-    for level, images in noisy:
-        noise, estimate = (
-            stars.noise.kappa * level,
-            method_fit.estimate(images, level, stars.position),
-        )
-        estimates[level] = method_fit, estimate
+    for level, images, estimate in estimate_levels(method_fit, noisy, stars.position):
+        noise = stars.noise.kappa * level
+        estimates[level] = method_fit, images, estimate
         # Errors of the restored stars, and of the noisy images as a reference.
         quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(
@@ -314,6 +331,29 @@ def metrics_by_level(
             }
         )
     return rows
+
+
+def estimate_levels(
+    method_fit: Method, noisy: Iterable[tuple[float, np.ndarray]], position: np.ndarray
+) -> Iterator[tuple[float, np.ndarray, Estimate]]:
+    """Yield each noise level λ, its noisy images of all stars, and the estimate of a method.
+
+    Parameters are as for `metrics_by_level`, and `position` (n, 2) or (n, 4) of its stars.
+    """
+    if not method_fit.knows_field:
+        for level, images in noisy:
+            yield level, images, method_fit.estimate(images, level, position)
+        return
+    # Each node of a field model takes a time that does not depend on the number of stars: the test
+    # stars of an image, which are few, are estimated at all levels together.
+    levels, stacks = zip(*noisy, strict=True)
+    star_level, repeated_position = (
+        np.repeat(levels, len(position)),
+        np.tile(position, (len(levels), 1)),
+    )
+    estimate = method_fit.estimate(np.concatenate(stacks), star_level, repeated_position)
+    parts = estimate.split(len(position))
+    yield from zip(levels, stacks, parts, strict=True)
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:

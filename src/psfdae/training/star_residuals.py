@@ -23,7 +23,7 @@ from psfdae.training.settings import Settings
 def reject_misfits(candidates: Candidates, settings: Settings, gain: float | None) -> Candidates:
     """Reject bright stars whose residuals about a fitted field are far larger than typical.
 
-    Fit and rejection are repeated until no star is rejected. The residual of a star is
+    Fit and rejection are repeated until hardly a star is rejected. The residual of a star is
 
         d² = Σ p (r² − σ²) / Σ p³
 
@@ -72,4 +72,7 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
     verdict = candidates.verdict.copy()
     verdict[stars.row[is_misfit]] = Verdict.MISFIT
     kept_stars = bright.select(np.delete(np.arange(len(bright)), rows[is_misfit]))
-    return reject_misfits(replace(candidates, verdict=verdict, bright=kept_stars), settings, gain)
+    kept_candidates = replace(candidates, verdict=verdict, bright=kept_stars)
+    # Another fit, without less than one star in a hundred, would hardly differ.
+    is_settled = np.count_nonzero(is_misfit) < 0.01 * len(stars)
+    return kept_candidates if is_settled else reject_misfits(kept_candidates, settings, gain)

@@ -180,6 +180,8 @@ class HeldOutStars:
         Error of the flux, which is taken to be 1, due to noise in the image.
     own_noise : ndarray, shape (n, d, d)
         Standard deviation of the noise that is in the pixels already.
+    star : ndarray of int, shape (n,), or None
+        Star of each image, if stars of an image have several; they come in turn.
     """
 
     images: np.ndarray
@@ -188,6 +190,7 @@ class HeldOutStars:
     position: np.ndarray
     flux_error: np.ndarray
     own_noise: np.ndarray
+    star: np.ndarray | None = None
 
     min_images: ClassVar[int] = 250
 
@@ -200,8 +203,13 @@ class HeldOutStars:
         flux_error, pixel_noise = own_noise(stars, truth, noise.background)
         # All stars of the product, of which the test stars are taken.
         arrays = (stars["realisation"], truth, field_positions(stars), flux_error, pixel_noise)
-        images, references, position, *noise_in_image = (array[test] for array in arrays)
-        return cls(images, references, noise, position, *noise_in_image)
+        images, references, position, flux_error, pixel_noise = (array[test] for array in arrays)
+        star = stars["field_index"][test] if are_real(stars) else None
+        return cls(images, references, noise, position, flux_error, pixel_noise, star)
+
+    def count_stars(self) -> int:
+        """Return the number of different stars."""
+        return len(self.images) if self.star is None else len(np.unique(self.star))
 
     def draw(self, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Return at least `min_images` noisy images (n, d, d) of flux 1, and their stars (n,)."""

@@ -54,8 +54,8 @@ class ImageStars:
     exposures : sequence of ImageStars
         The stars of each image, if there are several.
     estimates : dict
-        By noise level λ, the method of the model that was packed last, and its estimate of the
-        noisy test images, which the report shows.
+        By noise level λ, the method of the model that was packed last, the noisy test images, and
+        its estimate of them, which the report shows.
 
     Examples
     --------
@@ -73,7 +73,7 @@ class ImageStars:
     settings: Settings
     notes: Sequence[str]
     exposures: Sequence[ImageStars] = ()
-    estimates: dict[float, tuple[Method, Estimate]] = field(default_factory=dict)
+    estimates: dict[float, tuple[Method, np.ndarray, Estimate]] = field(default_factory=dict)
     split_kind: ClassVar[str] = "held_out"
     """Kind of the split: all images of a star are in the training, or all are in the test."""
     reference: ClassVar[str] = "realisation"

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, ValidationError, create_model, model_validator
+from pydantic import ValidationError, create_model, model_validator
 
 from psfdae.base.settings import Group
 from psfdae.telescope.settings import Telescope, has_own_aberrations
@@ -35,9 +35,6 @@ class Consistent(Group):
     edge and spacing of the field points, and the search distances of brightest
     pixels, which have the telescope's pixels.
     """
-
-    # Models that are made of groups have no source text, in which docstrings could be searched.
-    model_config = ConfigDict(use_attribute_docstrings=False)
 
     @model_validator(mode="before")
     @classmethod

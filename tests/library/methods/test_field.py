@@ -673,7 +673,7 @@ def test_a_change_between_exposures_is_a_fraction_of_the_coefficient(stars, fiel
     """The ridge ρ = 1/(change |c| + min)²: a change by that fraction is one standard deviation."""
     ridges = []
 
-    def solve(terms, data, weight, splines, penalty, ridge, start, tolerance):
+    def solve(terms, data, weight, splines, penalty, ridge, start, tolerance, preconditioners):
         ridges.append(ridge)
         return np.zeros(ridge.shape)
 

@@ -395,7 +395,8 @@ def test_derivatives_of_a_grid_are_those_of_its_light(sky):
     grid, step = PsfGrid.sample(load_model(sky[1]), 4, 4), 1e-3
     place = np.array([[grid.columns.mean() + 0.3, grid.rows.mean() - 0.4]])
     corner = np.rint(place).astype(int) - 4
-    slopes = grid.slopes(place, corner, 9)[0]
+    light, *slopes = grid.stamps_and_slopes(place, corner, 9)[0]
+    assert (light == grid.stamps(place, corner, 9)[0]).all()
     for slope, move in zip(slopes, step * np.eye(2), strict=True):
         low, high = (grid.stamps(place + s * move, corner, 9)[0] for s in (-1, 1))
         assert slope == pytest.approx(

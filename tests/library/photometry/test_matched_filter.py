@@ -57,7 +57,8 @@ def test_flux_and_snr_are_those_of_a_least_squares_fit(fwhm, phase):
     phases = 15 + 0.5 * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
     psf = grid.stamps(phases, np.repeat(corner, 4, axis=0), 13)
     # Most of the scatter is below 1 by a factor: the noise is that of σ.
-    (snr,), (flux,) = measure_snr(residual[None], sigma[None], psf[None])
+    maps = (values.astype(np.float32)[None] for values in (residual / sigma, 1.0 / sigma))
+    (snr,), (flux,) = measure_snr(*maps, psf[None])
     star = grid.stamps(np.array([phase]) + 15, corner, 13)[0]
     weight = sigma[9:22, 9:22] ** -2.0
     information = (star**2 * weight).sum()

@@ -85,7 +85,7 @@ def left_out_stars(
     # Weights of pixels as at the end of the fit, lower for pixels of neighbours (eq. 3).
     weight = fitter.pixel_weight(fit.flux, star_images)
     noise = fitter.pixel_variance(fit.flux, star_images)
-    weight /= 1.0 + fit.residual**2 * weight / settings.outlier_sigma**2
+    weight *= fitter.robust_weight(fit.residual, weight)
     good_weight = weight * fit.good[:, None, None]
     # Splines begin at the splines of the fit, or of other options fitted to all stars.
     if options is None:
@@ -97,6 +97,7 @@ def left_out_stars(
         fitter.advance(1)
     spacing = compute_spacing(len(fitter.axis), options.knots)
     fold, judged_stars = np.arange(len(terms)) % settings.folds, 0
+    preconditioners: list[np.ndarray] = []
     # Errors are computed in the stamps that a model restores.
     axis = fitter.axis[fitter.in_stamp]
     box = np.ix_(np.arange(len(terms)), fitter.in_stamp, fitter.in_stamp)
@@ -107,7 +108,7 @@ def left_out_stars(
         # Splines without the stars of this fold.
         fold_weight = good_weight * (fold != left_out)[:, None, None]
         fold_coefficients = fitter.fit_splines(
-            options, terms, data, fold_weight, fit.centre, coefficients
+            options, terms, data, fold_weight, fit.centre, coefficients, preconditioners
         )
         images, is_valid = data[box][rows], fitter.is_valid[box][rows].astype(float)
         splines = np.tensordot(terms[rows], fold_coefficients, 1)
@@ -156,8 +157,11 @@ def field_uncertainty(
     the field (parametric bootstrap: Efron & Tibshirani 1993, An Introduction to the Bootstrap,
     ch. 6.5). Light that the model does not contain appears as sky in left-out stars.
     """
-    # Light that is mistaken for sky in left-out stars, and its σ.
-    parts = list(left_out_stars(fitter, fit))
+    # Light that is mistaken for sky in left-out stars, and its σ. Only differences of fields are
+    # used, which need less accuracy than the field.
+    settings = fitter.settings
+    less_accurate = replace(fit.options, tolerance=settings.early_tolerance)
+    parts = list(left_out_stars(fitter, fit._replace(options=less_accurate)))
     light = np.concatenate([part.light for part in parts], axis=1)
     # Delete-group jackknife (Kott 2001, J. Off. Stat. 17, 521): without each of K folds in turn,
     # fields scatter by 1/√(K − 1) of their error. The scatter is larger where a fit of p terms
@@ -168,14 +172,16 @@ def field_uncertainty(
     jackknife = [replace(fit.model, coefficients=fit.model.coefficients + f) for f in fields]
     # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
     stars = fit.model.images(fit.model.terms(fitter.place), fit.centre, len(fitter.axis))
-    stars = stars * fit.flux[:, None, None]
-    variance = np.maximum(stars, 0.0) / fitter.photons[:, None, None]
-    sigma = np.sqrt(variance + fitter.noise[:, None, None] ** 2)
-    options = replace(fit.options, tolerance=fitter.settings.compared_tolerance)
-    bootstrap = []
+    sigma = np.sqrt(fitter.pixel_variance(fit.flux, stars))
+    options = replace(fit.options, tolerance=settings.compared_tolerance)
+    bootstrap, all_good = [], np.ones_like(fit.good)
     for _ in range(4):
-        images = np.where(fitter.is_valid, stars + sigma * rng.normal(size=stars.shape), 0.0)
-        bootstrap.append(replace(fitter, images=images).fit(options).model)
+        # The fits start at the truth.
+        noise = np.where(fitter.is_valid, sigma * rng.normal(size=stars.shape), 0.0)
+        start = fit._replace(good=all_good, residual=noise)
+        images = np.where(fitter.is_valid, stars, 0.0) + noise
+        noisy_fitter = replace(fitter, images=images * fit.flux[:, None, None])
+        bootstrap.append(noisy_fitter.fit(options, start).model)
     return FieldUncertainty(tuple(bootstrap), tuple(jackknife), excess_scatter(*light))
 
 

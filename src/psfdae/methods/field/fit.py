@@ -104,7 +104,7 @@ class FitSettings:
 
     rounds: int = 3
     centre_steps: int = 2
-    left_out_steps: int = 5
+    left_out_steps: int = 3
     window_px: float = 1.2
     window_reach_px: float = 1.0
     wide_reach_px: float = 1.5
@@ -268,29 +268,48 @@ class FieldFitter:
         """Pixels along a side of the frame that are in the stamp, (s,) of bool."""
         return np.asarray(np.abs(self.axis + 0.5) < self.stamp_px / 2)
 
-    def fit(self, options: FitOptions) -> FieldFit:
-        """Fit field, fluxes and centres to all stars in alternation (eq. 2 to 4)."""
+    def fit(self, options: FitOptions, start: FieldFit | None = None) -> FieldFit:
+        """Fit field, fluxes and centres to all stars in alternation (eq. 2 to 4).
+
+        Parameters
+        ----------
+        options : FitOptions
+            Options of the splines.
+        start : FieldFit, optional
+            Fit of these stars with any options. The new one starts at its fluxes, centres and
+            weights, and takes one round less.
+        """
         settings, spacing = self.settings, compute_spacing(len(self.axis), options.knots)
         low, high = self.select_ranges(options.star_terms)
         terms = field_terms(self.place, low, high, options.order)
-        # First fluxes are the light in the frames, first centres centroids in a Gaussian window.
-        good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
-        start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
-        is_usual = self.window_px == settings.window_px
-        reach = settings.window_reach_px if is_usual else settings.wide_reach_px
-        centre = find_centroids(self.images, start, window, 4, reach)
-        # Weights w = 1/variance follow from the expected light of a star, first from the median
-        # star. Weights from its own pixels would be larger where noise makes them fainter, and
-        # would bias the wings (Humphrey, Liu & Buote 2009, ApJ 693, 822).
-        light = np.median(self.images / flux[:, None, None], axis=0)
-        robust_weight, pixel_weight = np.ones(self.images.shape), self.pixel_weight(flux, light)
-        coefficients: np.ndarray | None = None
+        coefficients: np.ndarray | None
+        if start is None:
+            # First fluxes are the light in the frames, centres centroids in a Gaussian window.
+            good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
+            origin, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
+            is_usual = self.window_px == settings.window_px
+            reach = settings.window_reach_px if is_usual else settings.wide_reach_px
+            centre = find_centroids(self.images, origin, window, 4, reach)
+            # Weights w = 1/variance follow from the expected light of a star, first from the median
+            # star. Weights from its own pixels would be larger where noise makes them fainter, and
+            # would bias the wings (Humphrey, Liu & Buote 2009, ApJ 693, 822).
+            light = np.median(self.images / flux[:, None, None], axis=0)
+            robust_weight, pixel_weight = np.ones(self.images.shape), self.pixel_weight(flux, light)
+            first_round, coefficients = 0, None
+        else:
+            good, flux, centre = start.good, start.flux, start.centre
+            light = self.images / flux[:, None, None] - start.residual
+            pixel_weight = self.pixel_weight(flux, light)
+            robust_weight = self.robust_weight(start.residual, pixel_weight)
+            first_round, coefficients = 1, start.model.coefficients
+            if coefficients.shape != (terms.shape[1], options.knots, options.knots):
+                coefficients = None
         # Sums of the B-splines over the pixels of a stamp along an axis, of a star in its middle.
         stamp_axis = np.arange(self.stamp_px) - self.stamp_px // 2.0
         middle = cubic_splines(stamp_axis, options.knots, spacing).sum(axis=0)
         # Centres and weights of the last round are still to come: the others need less accuracy.
         early = replace(options, tolerance=max(options.tolerance, settings.early_tolerance))
-        for turn in range(settings.rounds):
+        for turn in range(first_round, settings.rounds):
             # Splines at given centres and fluxes (eq. 2), then centres and fluxes at given splines
             # (eq. 4).
             data = self.images / flux[:, None, None]
@@ -321,12 +340,12 @@ class FieldFitter:
             relative_light *= (terms @ term_light / total)[:, None, None]
             flux, star_images = flux * relative_light[:, 0, 0], star_images / relative_light
             residual = np.where(self.is_valid, self.images / flux[:, None, None] - star_images, 0.0)
-            # Outliers: pixels get less weight (Cauchy's weight 1/(1 + r² w/3²)), stars with a large
-            # χ² none. In the first round, the field is not known well enough to reject stars.
+            # Outliers: pixels get less weight, stars with a large χ² none. In the first round, the
+            # field is not known well enough to reject stars.
             pixel_weight = self.pixel_weight(flux, star_images)
-            square = residual**2 * pixel_weight
-            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.is_valid.sum(axis=(1, 2)), 1)
-            robust_weight = 1.0 / (1.0 + square / settings.outlier_sigma**2)
+            robust_weight = self.robust_weight(residual, pixel_weight)
+            chi2 = (residual**2 * pixel_weight).sum(axis=(1, 2))
+            chi2 /= np.maximum(self.is_valid.sum(axis=(1, 2)), 1)
             if turn:
                 good = chi2 < settings.outlier_chi2 * np.median(chi2)
         assert coefficients is not None
@@ -355,6 +374,10 @@ class FieldFitter:
         variance = self.pixel_variance(flux, light) + model_error**2 + self.settings.min_error**2
         return np.where(self.is_valid, 1.0 / variance, 0.0)
 
+    def robust_weight(self, residual: np.ndarray, pixel_weight: np.ndarray) -> np.ndarray:
+        """Return Cauchy's weight 1/(1 + r² w/3²) of pixels with residuals r and weights w."""
+        return np.asarray(1.0 / (1.0 + residual**2 * pixel_weight / self.settings.outlier_sigma**2))
+
     def pixel_variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the variance of pixels of stars of flux 1, due to sky and photons of the star."""
         # (σ/F)² + f / (g F), the first two terms of eq. 3.
@@ -370,6 +393,7 @@ class FieldFitter:
         weight: np.ndarray,
         centre: np.ndarray,
         start: np.ndarray | None,
+        preconditioners: list[np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return coefficients (K, N, N) of weighted least squares at given centres (eq. 2, 5).
 
@@ -385,6 +409,8 @@ class FieldFitter:
             Centres (row, column) from the middle pixel.
         start : ndarray, shape (K, N, N), or None
             Coefficients of the previous round.
+        preconditioners : list of ndarray, optional
+            See `solve_splines`.
         """
         # Stars without a pixel of positive weight do not contribute.
         has_weight = weight.any(axis=(1, 2))
@@ -418,6 +444,14 @@ class FieldFitter:
         if start is not None:
             start = start - prior_coefficients
         change = solve_splines(
-            terms, data, weight, (rows, columns), penalty, ridge, start, options.tolerance
+            terms,
+            data,
+            weight,
+            (rows, columns),
+            penalty,
+            ridge,
+            start,
+            options.tolerance,
+            preconditioners,
         )
         return change + prior_coefficients

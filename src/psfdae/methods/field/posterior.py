@@ -372,33 +372,43 @@ def _mix_pixels(
 
 
 class NoiseClasses(NamedTuple):
-    """Classes of stars with about the same noise, which share the variance of their pixels.
+    """Noise variances between which the variance of the pixels of n stars is interpolated.
 
     The variance inside a node depends only on s and σ (eq. 14).
 
     Attributes
     ----------
-    number : ndarray of int, shape (n,)
-        Index of the class of each star.
+    ends : ndarray of int, shape (2, n)
+        Indices of the classes below and above each star.
+    fraction : ndarray, shape (n, 1), float32
+        Weight of the class above.
     variance : ndarray, shape (C, 1)
         s of each class.
     sigma : ndarray, shape (C, 3)
         Prior σ of the nuisance parameters of each class.
     """
 
-    number: np.ndarray
+    ends: np.ndarray
+    fraction: np.ndarray
     variance: np.ndarray
     sigma: np.ndarray
 
     @classmethod
     def from_noise(cls, s: np.ndarray, sigma: np.ndarray) -> NoiseClasses:
         """Return the classes of stars by their s, (n, 1), and prior σ, (n, 3)."""
-        # ln s is rounded to steps of 0.1, which changes a standard deviation by at most 2.5 %.
-        ln_step = 0.1
-        noise_step = np.rint(np.log(s) / ln_step)
-        classes = np.column_stack([noise_step, sigma])
-        _, example, number = np.unique(classes, axis=0, return_index=True, return_inverse=True)
-        return cls(number, np.exp(ln_step * noise_step[example]), sigma[example])
+        # Steps of 0.5 in ln s, between which a variance is linear to 1 %.
+        ln_step = 0.5
+        place = np.log(s) / ln_step
+        below = np.floor(place)
+        fraction = (place - below).astype(np.float32)
+        knots = np.column_stack([np.vstack([below, below + 1.0]), np.tile(sigma, (2, 1))])
+        classes, ends = np.unique(knots, axis=0, return_inverse=True)
+        # Stars of few noise levels are classes themselves.
+        levels, number = np.unique(np.column_stack([s, sigma]), axis=0, return_inverse=True)
+        if len(levels) <= len(classes):
+            ends, no_step = np.stack([number.ravel()] * 2), np.zeros_like(fraction)
+            return cls(ends, no_step, levels[:, :1], levels[:, 1:])
+        return cls(ends.reshape(2, -1), fraction, np.exp(ln_step * classes[:, :1]), classes[:, 1:])
 
     def pixel_variance(self, axes: NodeAxes, stars: np.ndarray) -> np.ndarray:
         """Return the variance (n, P) of the pixels of the stars with these indices in a node.
@@ -406,9 +416,10 @@ class NoiseClasses(NamedTuple):
         It is in single precision.
         """
         # Once for each class that occurs.
-        classes, index = np.unique(self.number[stars], return_inverse=True)
+        classes, index = np.unique(self.ends[:, stars], return_inverse=True)
         variance = axes.pixel_variance(self.variance[classes], self.sigma[classes])
-        return variance.astype(np.float32)[index]
+        below, above = variance.astype(np.float32)[index.reshape(2, -1)]
+        return np.asarray(below + self.fraction[stars] * (above - below))
 
 
 def _corrections(

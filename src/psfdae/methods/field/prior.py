@@ -59,7 +59,7 @@ class PosteriorLimits:
 
     min_nodes: int = 9
     max_node_area_px2: float = 3.0
-    min_axes: int = 96
+    min_axes: int = 64
     outlier_axes: int = 12
     stars_at_once: int = 2048
 

@@ -151,13 +151,13 @@ class CrossValidation:
     def is_better(self, options: FitOptions, reference: FitOptions, factor: float = 1.0) -> bool:
         """Return True if the squared errors are smaller than with the reference, times a factor.
 
-        The comparison ends after as many folds as show the difference at 4 σ.
+        The comparison ends after as many folds as show the difference at 3 σ.
         """
         gain = np.empty(0)
         for fold in range(self.fitter.settings.folds):
             errors, reference_errors = (self._fold_errors(o, fold) for o in (options, reference))
             gain = np.append(gain, reference_errors - errors + np.log(factor))
-            if len(gain) >= 20 and abs(gain.mean()) > 4.0 * gain.std() / np.sqrt(len(gain)):
+            if len(gain) >= 20 and abs(gain.mean()) > 3.0 * gain.std() / np.sqrt(len(gain)):
                 break
         return bool(gain.mean() > 0)
 
