@@ -268,6 +268,24 @@ def trainings() -> pd.DataFrame:
     )
 
 
+def image_costs() -> pd.DataFrame:
+    """CPU time of models of images, by psfdae and other programs, and of photometry."""
+    table = read_record("tables/benchmark_images.csv")
+    table = table.assign(job=table.tool.str.split().str[0] + "_" + table.step)
+    # The earlier commit is left out; images of all programs.
+    table = table[~table.tool.str.startswith("psfdae ")]
+    wide = table.pivot(index="image", columns="job", values=["cpu_s", "peak_mb"])
+    seconds = wide.cpu_s.dropna().assign(peak_mb=wide.peak_mb.psfdae_train).reset_index()
+    return formatted(
+        seconds,
+        image="{image}",
+        model="{psfdae_train:.1f} s, {peak_mb:.0f} MB",
+        photometry="{psfdae_photometry:.1f} s",
+        **{"PSFEx, SExtractor": "{psfex_train:.1f} s", "EPSFBuilder": "{epsfbuilder_train:.1f} s"},
+        Piff="{piff_train:.1f} s",
+    )
+
+
 def propagators() -> pd.DataFrame:
     """Factors by which other propagators are slower than ours at equal error, scene 1."""
     rows = read_record("tables/benchmark_peers.csv")
@@ -571,7 +589,7 @@ TABLES: dict[str, Callable[[], pd.DataFrame]] = {
         for function in (
             *(paper_preset, all_errors, optics, denoisers, seed_scatters),
             *(alignment_errors, alignment_correlations),
-            *(costs, trainings, propagators, stages, flux_errors),
+            *(costs, trainings, image_costs, propagators, stages, flux_errors),
             *(own_stars, real_image, real_image_ratios, poppy_stars, coverage, outliers),
             *(night_cost, calibration, paper_columns, pixel_scales, held_out_fields, paper_rows),
             *(posterior_means, efficiencies, image_options),
