@@ -286,11 +286,11 @@ def line_through(x: np.ndarray, y: np.ndarray) -> Line:
         size = len(part), int(strip.max()) + 1
         strip += size[1] * np.arange(size[0])[:, None]
         count = np.bincount(strip.ravel(), minlength=size[0] * size[1]).reshape(size)
-        best, best_strip = np.unravel_index(count.argmax(), size)
-        if count[best, best_strip] > most_pixels:
-            most_pixels = int(count[best, best_strip])
-            distance_px = float(smallest[best]) + 2.0 * float(best_strip) + 1.0
-            line = Line(float(part[best]), distance_px)
+        best_angle, best_strip = np.unravel_index(count.argmax(), size)
+        if count[best_angle, best_strip] > most_pixels:
+            most_pixels = int(count[best_angle, best_strip])
+            distance_px = float(smallest[best_angle]) + 2.0 * float(best_strip) + 1.0
+            line = Line(float(part[best_angle]), distance_px)
     # Least-squares fit of angle and distance to the pixels near the line, three times.
     for reach_px in (5.0, 3.0, 3.0):
         across, along = line.across(x, y), line.along(x, y)

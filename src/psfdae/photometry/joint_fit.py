@@ -283,8 +283,7 @@ class _Fit:
 
     def move(self, rows: np.ndarray, change: np.ndarray) -> None:
         """Change flux, x and y of some stars, ascending, by (k, 3)."""
-        drawn = self._corner, self._light, self._derivatives
-        self._before_move = rows, [values[rows] for values in drawn]
+        self._before_move = rows, [values[rows] for values in self._star_arrays]
         # The old light is added to the residuals, and the light at the new position is subtracted.
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] += change[:, 0]
@@ -292,16 +291,20 @@ class _Fit:
         self._draw(rows)
         self._subtract(rows, self.flux[rows])
 
+    @property
+    def _star_arrays(self) -> tuple[np.ndarray, ...]:
+        """Arrays with a row for each star, which are computed when it is drawn."""
+        return self._corner, self._light, self._derivatives
+
     def take_back(self, rows: np.ndarray, change: np.ndarray) -> None:
         """Take the last change (k, 3) of some of the moved stars back, which are not drawn anew."""
         self._subtract(rows, -self.flux[rows])
         self.flux[rows] -= change[:, 0]
         self.position[rows] -= change[:, 1:]
-        moved_rows, drawn_before = self._before_move
+        moved_rows, earlier_arrays = self._before_move
         at = np.searchsorted(moved_rows, rows)
-        drawn = self._corner, self._light, self._derivatives
-        for values, before in zip(drawn, drawn_before, strict=True):
-            values[rows] = before[at]
+        for values, earlier_values in zip(self._star_arrays, earlier_arrays, strict=True):
+            values[rows] = earlier_values[at]
         self._subtract(rows, self.flux[rows])
 
     def design(self, rows: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ def measure_snr(
     size = [fft.next_fast_len(side, real=True) for side in (height, width)]
     inner = np.s_[..., : height + 1 - psf.shape[-1], : width + 1 - psf.shape[-1]]
     square = np.square(psf.astype(np.float32))
-    # Rows beyond those of a PSF are 0, and so are their transforms along x.
+    # Rows beyond the PSF are 0, and so are their transforms along x.
     kernels = [
         np.conj(fft.fft(fft.rfft(values, size[1]), size[0], axis=-2))
         for values in (psf.astype(np.float32), square)

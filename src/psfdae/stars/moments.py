@@ -54,8 +54,8 @@ def middle_value(values: np.ndarray) -> Any:
     """
     # numpy parts an array at one index with the processor's vectors, and at two without them.
     half = len(values) // 2
-    ordered = np.partition(values, half)
-    return ordered[half] if len(values) % 2 else 0.5 * (ordered[:half].max() + ordered[half])
+    halves = np.partition(values, half)
+    return halves[half] if len(values) % 2 else 0.5 * (halves[:half].max() + halves[half])
 
 
 def row_medians(values: np.ndarray) -> np.ndarray:

@@ -571,8 +571,8 @@ class Refiner:
         np.add.at(variance, number, weight * (scatter + (mean - psf[number]) ** 2))
         return stars, RefinedPsfs(psf, variance, evidence)
 
-    def measure_misfit(self, refined: RefinedPsfs) -> np.ndarray:
-        """Return scores (n,) that are large for stars unlike those of the telescope.
+    def measure_misfit(self, posteriors: RefinedPsfs) -> np.ndarray:
+        """Return scores (n,) that are large for stars that the telescope does not give.
 
         A score is −2 ln of the evidence, plus the square of the significance with which the
         brightest pixel is farther from the middle than a centring error.
@@ -580,14 +580,14 @@ class Refiner:
         # Brightest pixels among those that a star is centred on, and among the others.
         distance = np.abs(np.arange(self.stamp_px) - self.stamp_px // 2)
         is_middle = np.maximum.outer(distance, distance).ravel() <= self.jitter_px
-        star = np.arange(len(refined.psf))
+        star = np.arange(len(posteriors.psf))
         inner, outer = (
-            np.where(is_part, refined.psf, -np.inf).argmax(axis=1)
+            np.where(is_part, posteriors.psf, -np.inf).argmax(axis=1)
             for is_part in (is_middle, ~is_middle)
         )
-        excess = refined.psf[star, outer] - refined.psf[star, inner]
-        variance = refined.variance[star, outer] + refined.variance[star, inner]
-        return np.asarray(np.maximum(excess, 0.0) ** 2 / variance - 2.0 * refined.evidence)
+        excess = posteriors.psf[star, outer] - posteriors.psf[star, inner]
+        variance = posteriors.variance[star, outer] + posteriors.variance[star, inner]
+        return np.asarray(np.maximum(excess, 0.0) ** 2 / variance - 2.0 * posteriors.evidence)
 
     @cached_property
     def root(self) -> np.ndarray:
