@@ -36,7 +36,7 @@ def fill_bad(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray
         return result, remaining
 
     def look_up(down: int, across: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels off the bad ones by these steps, 0 if bad, and which are good."""
+        """Return the values of pixels at these steps from the bad ones, and which are good."""
         at_row, at_column = row + down, column + across
         is_inside = (at_row >= 0) & (at_row < bad.shape[0])
         is_inside &= (at_column >= 0) & (at_column < bad.shape[1])

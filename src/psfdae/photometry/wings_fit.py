@@ -102,7 +102,7 @@ def star_bins(
     stamp_end = np.maximum(np.ceil(positions + half_px).astype(int) - first, 0)
     limits = np.concatenate([first, end, stamp_first, stamp_end], axis=1)
     for star in np.flatnonzero((first < end).all(axis=1)).tolist():
-        # Numbers of Python: sums of an array's elements take longer.
+        # Python numbers: arithmetic with single elements of an array takes longer.
         x, y = positions[star].tolist()
         column, row, column_end, row_end, *stamp = limits[star].tolist()
         # Distances of the pixels from the star along either axis, and from its centre, in bins.

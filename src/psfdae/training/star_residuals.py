@@ -23,7 +23,8 @@ from psfdae.training.settings import Settings
 def reject_misfits(candidates: Candidates, settings: Settings, gain: float | None) -> Candidates:
     """Reject bright stars whose residuals about a fitted field are far larger than typical.
 
-    Fit and rejection are repeated until hardly a star is rejected. The residual of a star is
+    Fit and rejection are repeated until fewer than one star in a hundred are rejected. The residual
+    of a star is
 
         d² = Σ p (r² − σ²) / Σ p³
 
@@ -73,6 +74,6 @@ def reject_misfits(candidates: Candidates, settings: Settings, gain: float | Non
     verdict[stars.row[is_misfit]] = Verdict.MISFIT
     kept_stars = bright.select(np.delete(np.arange(len(bright)), rows[is_misfit]))
     kept_candidates = replace(candidates, verdict=verdict, bright=kept_stars)
-    # Another fit, without less than one star in a hundred, would hardly differ.
+    # A fit without these stars would hardly differ, if they are fewer than one in a hundred.
     is_settled = np.count_nonzero(is_misfit) < 0.01 * len(stars)
     return kept_candidates if is_settled else reject_misfits(kept_candidates, settings, gain)

@@ -13,11 +13,12 @@ c = s_fo + D_fᵀ z with z ~ N(0, 1). Product and integral are Gaussians: with e
     A = D M Dᵀ + 1,   b = D (g − M e),   ⟨z⟩ = A⁻¹ b,   cov z = A⁻¹,
     ln mass = gᵀe − ½ eᵀMe + ½ bᵀA⁻¹b − ½ ln |A|.
 
-A Gaussian is used near its expansion point only. Where much of the mass is far from all points of a
-star, the stamp is computed anew there: this climbs to a mode, and finds other wavefronts that give
-nearly the same image. A Gaussian belongs to the nearest point, so that no mass is counted twice. In
-the end the sums over all fields, offsets and points give the posterior mean ⟨p⟩ ≈ p + ⟨δ⟩ᵀ∂p, and
-its variance.
+Climbs start along the axis on which a proposal is least certain: images that are nearly the same
+have several wavefronts there. A Gaussian is used near its expansion point only. Where much of the
+mass is far from all points of a star, the stamp is computed anew there: this climbs to a mode, and
+finds other wavefronts that give nearly the same image. A Gaussian belongs to the nearest point, so
+that no mass is counted twice. In the end the sums over all fields, offsets and points give the
+posterior mean ⟨p⟩ ≈ p + ⟨δ⟩ᵀ∂p, and its variance.
 """
 
 from __future__ import annotations
@@ -581,12 +582,12 @@ class Refiner:
         distance = np.abs(np.arange(self.stamp_px) - self.stamp_px // 2)
         is_middle = np.maximum.outer(distance, distance).ravel() <= self.jitter_px
         star = np.arange(len(posteriors.psf))
-        inner, outer = (
-            np.where(is_part, posteriors.psf, -np.inf).argmax(axis=1)
+        central_pixel, distant_pixel = (
+            (star, np.where(is_part, posteriors.psf, -np.inf).argmax(axis=1))
             for is_part in (is_middle, ~is_middle)
         )
-        excess = posteriors.psf[star, outer] - posteriors.psf[star, inner]
-        variance = posteriors.variance[star, outer] + posteriors.variance[star, inner]
+        excess = posteriors.psf[distant_pixel] - posteriors.psf[central_pixel]
+        variance = posteriors.variance[distant_pixel] + posteriors.variance[central_pixel]
         return np.asarray(np.maximum(excess, 0.0) ** 2 / variance - 2.0 * posteriors.evidence)
 
     @cached_property

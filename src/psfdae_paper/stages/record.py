@@ -124,7 +124,7 @@ def reference(
     is_completed = bool(earlier) and not (results / "runtime.csv").is_file()
     may_stay = re.compile(".+") if is_completed else MAY_STAY
     new_names = list_current_files(results, plans, may_stay)
-    if is_completed and earlier["commit"] != commit:
+    if is_completed and earlier.get("commit") != commit:
         new_names = [name for name in new_names if MAY_STAY.fullmatch(name)]
     new_names += [name for name in IMAGE_COSTS if (results / name).is_file()]
     # Files of the earlier record that stay; those of a run of its own keep its date and commit.
