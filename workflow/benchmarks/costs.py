@@ -22,6 +22,7 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.comparison import read_seed_scatter
 
 PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
 Settings = dict[str, dict[PointName, list[str]]]
@@ -36,24 +37,25 @@ class Points(Group):
         Datasets on which all methods of the configuration are timed.
     further_methods : list of str
         Methods that are timed beside those.
-    networks : list of str
-        Methods that are timed only by the target `posterior_network`, because they train for long.
+    on_request : dict of str to list of str
+        Methods that only the target `posterior_network` times, by dataset.
     settings : dict
-        Overrides of the configuration, by method and by the name of the point.
+        Overrides of the configuration on `datasets`, by method and by the name of the point.
     trials : dict
         The same, on the first dataset alone.
     """
 
     datasets: Annotated[list[str], Field(min_length=1)]
     further_methods: list[str]
-    networks: list[str]
+    on_request: dict[str, list[str]]
     settings: Settings
     trials: Settings
 
     def overrides(self, dataset, name):
         """Return the overrides of a method by point; "configured" has none."""
+        settings = self.settings.get(name, {}) if dataset in self.datasets else {}
         trials = self.trials.get(name, {}) if dataset == self.datasets[0] else {}
-        return {"configured": [], **self.settings.get(name, {}), **trials}
+        return {"configured": [], **settings, **trials}
 
 
 def load_points():
@@ -87,6 +89,9 @@ def cost(
     knows_position = method_class(name).needs.position
     bound, is_tight = least_errors(read_table(bounds), dataset, knows_position)
     row = isolate(1, time_method, name, config.model_dump(), stars, bound)
+    # Fits of other seeds scatter, as far as the target `seeds` has measured it.
+    scatter = read_seed_scatter().get((dataset, "realisation", name), 0.0) * row["over_least"]
+    row["over_least_stderr"] = np.hypot(row["over_least_stderr"], scatter)
     key = {"dataset": dataset, "method": name, "point": point}
     write(out, [{**key, **row, "tight": "yes" if is_tight else "no"}])
 
@@ -178,8 +183,9 @@ def costs(
     lengths = table[(table.method == "dae") & table.settings.str.fullmatch(r"(train\.epochs=\d+)?")]
     table["knee"] = "no"
     for _, trainings in lengths.groupby("dataset"):
-        index = knee(trainings.fit_cpu_s.to_numpy(), trainings.over_least.to_numpy())
-        table.loc[trainings.index[index], "knee"] = "yes"
+        if len(trainings) > 1:
+            index = knee(trainings.fit_cpu_s.to_numpy(), trainings.over_least.to_numpy())
+            table.loc[trainings.index[index], "knee"] = "yes"
     write(out, table)
 
 

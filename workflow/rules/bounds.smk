@@ -100,6 +100,7 @@ use rule psf_bounds as psf_bounds_growth with:
         f"{RESULTS}/logs/bounds/psf_bounds_growth.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds_growth.tsv"
+    localrule: True
     message:
         "Collecting the dependence of the posterior means on their banks"
 
@@ -117,6 +118,7 @@ use rule psf_bounds as psf_optics with:
         f"{RESULTS}/logs/wavefront/psf_optics.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_optics.tsv"
+    localrule: True
     message:
         "Collecting the errors of the methods that know the telescope"
 

@@ -59,8 +59,7 @@ rule benchmark_costs:
         "python {params.program} --out {output} {input} > {log} 2>&1"
 
 
-# All methods, and the networks that are trained on simulated stars without end: on request, because
-# they train for minutes.
+# All methods, and networks that train for minutes, which are timed on request.
 use rule benchmark_costs as posterior_network_costs with:
     input:
         rules.benchmark_costs.output,
@@ -71,6 +70,7 @@ use rule benchmark_costs as posterior_network_costs with:
         f"{RESULTS}/logs/costs/posterior_network.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/posterior_network.tsv"
+    localrule: True
     message:
         "Joining errors and times of all methods and of the posterior networks"
 

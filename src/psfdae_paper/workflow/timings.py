@@ -48,12 +48,11 @@ def cost_tables(run: Run) -> list[str]:
 
 
 def network_cost_tables(run: Run) -> list[str]:
-    """Return the tables of the networks that are trained on simulated stars without end."""
-    points = load_timing_points()
+    """Return the tables of methods that are timed on request, such as networks."""
     return [
         path
-        for dataset in points.datasets
-        for name in points.networks
+        for dataset, names in load_timing_points().on_request.items()
+        for name in names
         for path in _list_cost_tables(run, dataset, name)
     ]
 

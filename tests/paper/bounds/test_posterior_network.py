@@ -379,6 +379,11 @@ def test_stars_of_an_image_and_templates_are_rejected(product, tmp_path):
 def test_networks_are_timed_only_on_request():
     points, config = load_points(), load(["dataset=dataset3"])
     kinds = ("", "_position", "_refined")
-    assert points.networks == [f"posterior_network{kind}" for kind in kinds]
-    assert set(points.networks).isdisjoint({*points.further_methods, *config.methods})
-    assert "configured" in points.overrides("dataset3", "posterior_network")
+    for dataset in points.datasets:
+        networks = points.on_request[dataset]
+        assert networks == [f"posterior_network{kind}" for kind in kinds]
+        assert set(networks).isdisjoint({*points.further_methods, *config.methods})
+        assert {"configured", "epochs8"} <= {*points.overrides(dataset, networks[0])}
+    # A dataset that only this target times has no other settings.
+    assert "static_posterior" in points.on_request["dataset8"]
+    assert points.overrides("dataset8", "dae") == {"configured": []}
