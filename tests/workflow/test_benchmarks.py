@@ -16,6 +16,7 @@ import figures
 import image_costs
 import propagators
 import scenes
+from psfdae.base.files import ProductError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
@@ -199,3 +200,8 @@ def test_levels_of_the_costs_are_those_with_a_tight_mean_without_the_position():
     # Without a tight mean all levels are taken.
     none = pd.DataFrame(rows).assign(tight="no")
     assert costs.least_errors(none, "d", False) == ({0.1: 1.0, 0.2: 2.0}, False)
+    # Errors over a least possible one of 0 are not defined.
+    exact = pd.DataFrame(rows).assign(tight="yes", value=[0.0, 2.0, 0.0, 0.0])
+    assert costs.least_errors(exact, "d", False) == ({0.2: 2.0}, True)
+    with pytest.raises(ProductError, match="d: the least possible error with the position is 0"):
+        costs.least_errors(exact, "d", True)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from measure import isolate, pareto, write
 from psfdae.base.belonging import STARS, require
-from psfdae.base.files import read_product
+from psfdae.base.files import ProductError, read_product
 from psfdae.base.options import File
 from psfdae.base.reading import read_table
 from psfdae.base.settings import Group
@@ -101,16 +101,26 @@ def least_errors(bounds, dataset, knows_position):
 
     It is the error of the posterior mean against the realisation, with or without the position in
     the field. Levels are those at which the one without is tight for all stars, so that all methods
-    have the same levels; all levels if there is none. The one with the position may not be tight
-    there, so that the minimum error may be lower.
+    have the same levels; all levels if there is none. Levels at which all stars are recognised are
+    left out: no error is a multiple of 0. The one with the position may not be tight there, so that
+    the minimum error may be lower.
+
+    Raises
+    ------
+    ProductError
+        If the error with the position is 0 at one of these levels.
     """
     rows = bounds.query("dataset == @dataset and reference == 'realisation' and metric == 'mse'")
     columns = ["value", "tight", "missing"]
     table = rows.pivot(index="noise_level", columns="method", values=columns)
     is_tight = table.tight.eq("yes") & table.missing.eq(0)
-    levels = table.index[is_tight.bayes] if is_tight.bayes.any() else table.index
+    values, is_positive = table.value.astype(float), table.value.bayes.astype(float) > 0
+    is_usable = is_tight.bayes if is_tight.bayes.any() else is_tight.bayes.notna()
     mean = "bayes_position" if knows_position else "bayes"
-    return table.value[mean][levels].astype(float).to_dict(), bool(is_tight[mean][levels].all())
+    least = values[mean][is_usable & is_positive]
+    if not (least > 0).all():
+        raise ProductError(f"{dataset}: the least possible error with the position is 0")
+    return least.to_dict(), bool(is_tight[mean][least.index].all())
 
 
 def time_method(name, tree, stars, bound):
