@@ -143,6 +143,31 @@ rule figure_alignment_errors:
         "psfdae paper alignment figure errors {params.inputs:q} --out {output} > {log} 2>&1"
 
 
+rule figure_alignment_costs:
+    input:
+        errors=rules.alignment_tables.output.errors,
+        times=rules.alignment_time.output,
+    output:
+        report(
+            f"{RESULTS}/figures/alignment/costs.png",
+            caption="../report/figure_alignment_costs.rst",
+            category=datasets.SCENE_HEADINGS["scene3"],
+            subcategory="estimates",
+            labels={"figure": "errors against time"},
+        ),
+    log:
+        f"{RESULTS}/logs/alignment/figure_costs.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/figure_costs.tsv"
+    params:
+        inputs=as_options,
+        source=hash_code("alignment figure costs"),
+    message:
+        "Drawing errors against time"
+    shell:
+        "psfdae paper alignment figure costs {params.inputs:q} --out {output} > {log} 2>&1"
+
+
 rule figure_alignment_correlation:
     input:
         correlation=rules.alignment_tables.output.correlation,

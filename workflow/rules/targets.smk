@@ -33,6 +33,7 @@ rule scene3:
         rules.figure_alignment_stamps.output,
         rules.figure_alignment_predicted.output,
         rules.figure_alignment_errors.output,
+        rules.figure_alignment_costs.output,
         rules.figure_alignment_twin.output,
         rules.figure_alignment_correlation.output,
         rules.track_alignment.output,

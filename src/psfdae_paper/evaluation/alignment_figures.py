@@ -1,4 +1,4 @@
-"""Figures of scene 3: stamps, estimates, errors, the twin ambiguity, correlations.
+"""Figures of scene 3: stamps, estimates, errors and times, the twin ambiguity, correlations.
 
 Functions take arrays of stamps and states and return matplotlib figures. A state is decentre x, y
 and tilt x, y of the secondary mirror, in units of their range.
@@ -170,6 +170,58 @@ def bin_errors(size: np.ndarray, error: np.ndarray) -> np.ndarray:
     bins = [b for b in np.array_split(np.argsort(size, kind="stable"), 6) if b.size]
     rows = [(size[b].mean(), error[b].mean(), error[b].std() / np.sqrt(b.size)) for b in bins]
     return np.array(rows).T
+
+
+@apply_style
+def draw_costs(errors: pd.DataFrame, times: pd.DataFrame) -> Figure:
+    """Draw errors over the Cramér–Rao bound against the time of training and of an estimate.
+
+    The ratio is a geometric mean over the four parameters, for uniform states with noise.
+
+    Parameters
+    ----------
+    errors : DataFrame
+        Rows of `alignment_tables.tabulate_errors` and `tabulate_bounds`.
+    times : DataFrame
+        Columns method, seconds_per_state, training_seconds.
+    """
+    is_shown = (errors.test_set == "uniform") & (errors.noise_level > 0) & (errors.unit == "range")
+    by_level = dict([*errors[is_shown].groupby("noise_level")])
+    figure = new_figure(1.2 + 2.7 * len(by_level), layout="constrained")
+    panels = figure.subplots(len(by_level), 2, sharex="col", sharey=True, squeeze=False)
+    for row_panels, (level, rows) in zip(panels, by_level.items(), strict=True):
+        by_method = {name: part.set_index("parameter") for name, part in rows.groupby("method")}
+        for method, training_s, state_s in zip(
+            times.method, times.training_seconds, times.seconds_per_state, strict=True
+        ):
+            estimator, part = ESTIMATORS[method], by_method[method]
+            # A method with unknown flux is compared with the bound with unknown flux.
+            bound = by_method["cramer_rao_free" if estimator.unknown_flux else "cramer_rao"]
+            ratio = np.exp(np.log(part.mean_abs_error / bound.mean_abs_error).mean())
+            # Errors of the four parameters come from the same stamps: their mean scatters as each.
+            stderr = ratio * (np.sqrt(part.variance_abs / part.n) / part.mean_abs_error).mean()
+            look = estimator.look
+            style: Style = {"color": look.color, "label": look.label, "marker": "o", "capsize": 2}
+            style["mfc"] = "white" if estimator.unknown_flux else look.color
+            for axes, cost in zip(row_panels, (training_s, 1e3 * state_s), strict=True):
+                axes.errorbar(cost, ratio, stderr, ls="", ms=7, **style)
+        row_panels[0].set_title(f"λ = {level:g}", loc="left")
+        for axes in row_panels:
+            axes.axhline(1.0, color="black", ls="--", lw=1.0)
+            axes.set_yscale("log")
+            axes.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+            axes.tick_params(axis="y", which="minor", labelleft=False)
+            axes.margins(0.1)
+            axes.grid(True, which="both")
+        # Trainings take about the same time, estimates do not.
+        row_panels[1].set_xscale("log")
+        row_panels[0].set_ylabel("mean absolute error / bound")
+    panels[-1, 0].set_xlabel("time of all trainings (s)")
+    panels[-1, 1].set_xlabel("time of an estimate (ms)")
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    figure.suptitle("Errors of uniform states over the Cramér–Rao bound, against time")
+    return figure
 
 
 @apply_style

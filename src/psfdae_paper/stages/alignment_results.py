@@ -368,6 +368,24 @@ def figure_errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) ->
     write_png(alignment_figures.draw_errors_by_size(truth, curves), out)
 
 
+@command("paper alignment figure costs")
+def figure_costs(errors: ErrorTable, times: File, out: Png) -> None:
+    """Draw errors over the Cramér-Rao bound against the time of training and of an estimate.
+
+    Errors are of uniform states; of estimates with unknown flux, the bound has unknown flux, too.
+
+    Parameters
+    ----------
+    errors : Path
+        CSV of `alignment tables` with the errors.
+    times : Path
+        CSV of `alignment time-table`.
+    out : Path
+        PNG.
+    """
+    write_png(alignment_figures.draw_costs(read_table(errors), read_table(times)), out)
+
+
 @command(
     "paper alignment figure twin",
     reads=("telescope", "prescription", "alignment", "optics", "noise"),

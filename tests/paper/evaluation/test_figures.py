@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
 
 import figures
 from psfdae.base.figures import apply_style
-from psfdae_paper.evaluation.alignment_figures import draw_twins
+from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
+from psfdae_paper.evaluation.alignment_figures import draw_costs, draw_twins
 from psfdae_paper.evaluation.curves import draw_errors, draw_training_curves
 from psfdae_paper.evaluation.figures import draw_templates
 from psfdae_paper.evaluation.paper import read_published
@@ -140,3 +143,33 @@ def test_methods_whose_bound_is_not_tight_have_open_markers(record_table, tight,
     panels = figure.axes[1::2]
     is_open = [line.get_mfc() == "white" for axes in panels for line in axes.lines]
     assert sum(is_open) == expected * len(panels)
+
+
+def test_alignment_errors_are_divided_by_the_bound_of_the_same_unknowns():
+    """Twice the bound with flux given, three times the one with unknown flux; grid states apart."""
+    mean_errors = {"noise_trained": 0.02, "cramer_rao": 0.01}
+    mean_errors |= {"max_likelihood_free": 0.06, "cramer_rao_free": 0.02}
+    keys = product(
+        ("uniform", "grid"), (0.0, 0.002), mean_errors, DEGREES_OF_FREEDOM, ("range", "m")
+    )
+    names = ["test_set", "noise_level", "method", "parameter", "unit"]
+    errors = pd.DataFrame(keys, columns=names)
+    factor = np.where(errors.test_set == "uniform", 1.0, 7.0) * np.where(
+        errors.unit == "m", 9.0, 1.0
+    )
+    errors["mean_abs_error"] = factor * errors.method.map(mean_errors)
+    # 10 % of the error, over √25 states.
+    errors = errors.assign(variance_abs=(0.1 * errors.mean_abs_error) ** 2, n=25)
+    times = pd.DataFrame(
+        {
+            "method": ["noise_trained", "max_likelihood_free"],
+            "seconds_per_state": [1e-3, 4e-2],
+            "training_seconds": [50.0, 60.0],
+        }
+    )
+    training, estimate = draw_costs(errors, times).axes
+    for axes, costs in ((training, [50.0, 60.0]), (estimate, [1.0, 40.0])):
+        points = [bars.lines[0].get_xydata()[0] for bars in axes.containers]
+        np.testing.assert_allclose(points, list(zip(costs, [2.0, 3.0], strict=True)), rtol=1e-12)
+        bars = [np.ptp(b.lines[2][0].get_segments()[0][:, 1]) for b in axes.containers]
+        np.testing.assert_allclose(bars, [2 * 0.02 * 2.0, 2 * 0.02 * 3.0], rtol=1e-9)
