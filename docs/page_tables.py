@@ -87,14 +87,17 @@ def provenance(*names: str) -> dict[str, object]:
 
 
 def recorded(path: Path) -> str:
-    """Return date and commit of a file that is not of the run of record, or an empty text."""
+    """Return date, commit and processor of a file of another run than the record, or ""."""
     if path.is_relative_to(RECORD):
         other_runs: Mapping[str, Mapping[str, str]] = provenance().get("other_runs", {})  # type: ignore[assignment]
         row = other_runs.get(path.relative_to(RECORD).as_posix())
     else:
         study = pd.read_csv(path).iloc[0] if path.suffix == ".csv" else {}
         row = study if "commit" in study else None
-    return "" if row is None else f"{row['date']} at commit {row['commit']:.12}"
+    if row is None:
+        return ""
+    processor = f" on {row['cpu']}" if "cpu" in row else ""
+    return f"{row['date']} at commit {row['commit']:.12}{processor}"
 
 
 def formatted(frame: pd.DataFrame, **columns: str) -> pd.DataFrame:

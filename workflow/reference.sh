@@ -17,6 +17,7 @@ plan main -- reference
 for sweep in dae_crop network_epochs; do
     [ ! -d "results/sweeps/$sweep" ] || plan "$sweep" --config "sweep=$sweep" -- sweep
 done
+[ ! -f results/tables/posterior_network.csv ] || plan network -- posterior_network
 [ ! -d results/paper ] || plan paper --config preset=paper -- psf_metrics
 
 for file in "$plans"/*; do set -- "$@" --plan "$file"; done

@@ -72,7 +72,9 @@ def test_a_table_of_an_earlier_record_gets_its_date(monkeypatch):
     monkeypatch.setitem(tables.TABLES, "both", lambda: tables.pd.DataFrame({"a": [1], "b": [2.5]}))
     page, path = ROOT / "README.md", f"results/reference/{name}"
     text = tables.insert_tables(f'Text.\n\n[All]({path} "table both")\n', page)
-    date = f"recorded {row['date']} at commit {row['commit'][:12]}, not with the run of record"
+    processor = f" on {row['cpu']}" if "cpu" in row else ""
+    date = f"recorded {row['date']} at commit {row['commit'][:12]}{processor}"
+    date += ", not with the run of record"
     # The table, and below it the link.
     assert text == (f"Text.\n\n| a | b |\n| --- | --- |\n| 1 | 2.5 |\n\n*[All]({path}), {date}.*\n")
     # A file of the run of record itself needs no date.

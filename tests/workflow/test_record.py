@@ -141,7 +141,7 @@ def test_a_later_run_completes_the_record_of_its_commit(results, history, tmp_pa
     record.reference(later, out, [plan(later, **pending, **{SLOW: "no update"})])
     assert (out / SLOW).read_text() == "b\n2\n"
     assert (out / "tables/t.csv").read_text() == "a\n1\n"
-    new_run = {"commit": commit, "date": date.today().isoformat()}
+    new_run = {"commit": commit, "date": date.today().isoformat(), "cpu": record.cpu_model()}
     assert recorded(out) == before | {"other_runs": {SLOW: new_run}}
     # Of another commit, only tables that take long are added; the costs of images name their own.
     second = history()

@@ -36,7 +36,12 @@ from psfdae_paper.source import cpu_model, git
 IMAGE_COSTS = ("tables/benchmark_images.csv", "figures/benchmark/images.png")
 """Files of `make benchmark TARGETS=images`, which names date and commit in its table."""
 
-MAY_STAY = re.compile("|".join([r"(sweeps|paper)/.+", *map(re.escape, IMAGE_COSTS)]))
+NETWORK_COSTS = ("tables/posterior_network.csv", "figures/benchmark/posterior_network.png")
+"""Files of `snakemake posterior_network`."""
+
+MAY_STAY = re.compile(
+    "|".join([r"(sweeps|paper)/.+", *map(re.escape, (*IMAGE_COSTS, *NETWORK_COSTS))])
+)
 """Names of files that may stay from an earlier record, because they take too long to compute."""
 
 
@@ -106,7 +111,7 @@ def reference(
 
     The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
     from these files alone. Provenance describes the run of runtime.csv; its entry `other_runs` has
-    date and commit of each file of another run. These commits must be in the history.
+    date and commit of each file of another run, and its processor if it completed a record. These commits must be in the history.
 
     Parameters
     ----------
@@ -134,7 +139,7 @@ def reference(
     other_runs = {name: earlier.get("other_runs", {}).get(name) for name in old_names}
     if is_completed:
         record = earlier
-        today = {"commit": commit, "date": date.today().isoformat()}
+        today = {"commit": commit, "date": date.today().isoformat(), "cpu": cpu_model()}
         other_runs = {name: run for name, run in other_runs.items() if run}
         other_runs |= dict.fromkeys(new_names, today)
     else:
