@@ -111,7 +111,8 @@ def reference(
 
     The folder receives tables, figures, runtime.csv and provenance.json; pages take their numbers
     from these files alone. Provenance describes the run of runtime.csv; its entry `other_runs` has
-    date and commit of each file of another run, and its processor if it completed a record. These commits must be in the history.
+    date and commit of each file of another run, and its processor if it completed a record. These
+    commits must be in the history.
 
     Parameters
     ----------
