@@ -1,15 +1,18 @@
 """Error against CPU seconds of training: architectures of a network for the posterior mean.
 
-    python studies/posterior_network/architectures.py RESULTS ARCHITECTURE OPTIMISER SECONDS LR
+    python studies/posterior_network/architectures.py RESULTS SECONDS OUT.csv
 
-RESULTS is the folder of a run with the stars of dataset 3. All architectures correct the linear
-estimate in its own units, and have the same stars (60 000 with all mirror images and centring
-errors, simulated before the clock starts), noise, weights of the levels and course of the rate.
-Prints CPU seconds, steps and the MSE of fresh stars at each noise level.
+RESULTS is the folder of a run with the stars of dataset 3. Each training of `TRAININGS` has the CPU
+time SECONDS. All architectures correct the linear estimate in its own units, and have the same
+stars (60 000 with all mirror images and centring errors, simulated before the clock starts), noise,
+weights of the levels and course of the rate. The table has CPU seconds, steps and the MSE of fresh
+stars at each noise level, and its ratio to the least possible one of the run of record (geometric
+mean over the levels). One thread.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 import sys
 import time
@@ -17,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from errors import STARS, read_least_errors
 from torch import nn
 from torch.nn import functional
 
@@ -28,7 +32,7 @@ from psfdae_paper.configuration.compose import load, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.stars.symmetry import SYMMETRIES
 
-SIDE, STARS, BATCH, WARM_UP = 16, 60_000, 1024, 0.05
+SIDE, STAR_COUNT, BATCH, WARM_UP = 16, 60_000, 1024, 0.05
 
 
 class Block(nn.Module):
@@ -176,6 +180,17 @@ ARCHITECTURES = {
 }
 
 
+TRAININGS = [
+    ("perceptron", "adam", 0.0005),
+    ("perceptron", "muon", 0.001),
+    ("group perceptron", "adam", 0.001),
+    ("group perceptron", "muon", 0.003),
+    ("U-Net", "adam", 0.001),
+    ("transformer", "adam", 0.001),
+]
+"""Architecture, optimiser and maximum of the learning rate."""
+
+
 def make_optimiser(network, optimiser, lr):
     """Return Adam, or Muon for the weights of the blocks and Adam for the others."""
     weights = [*network.parameters()]
@@ -186,18 +201,35 @@ def make_optimiser(network, optimiser, lr):
     return Muon([{"params": others}, {"params": inner, "orthogonal": True}], lr=lr, fused=True)
 
 
-def main(results, architecture, optimiser, seconds, lr):  # noqa: PLR0915
-    """Train for some CPU seconds, and print the errors on the way."""
+def main(results, seconds, out):
+    """Train all architectures, and write the errors on the way."""
     torch.set_num_threads(1)
-    torch.manual_seed(0)
     config = load(["dataset=dataset3"])
-    simulation, noise = part(SIMULATION, config.model_dump()), noise_model(config)
-    product = read_product(Path(results) / "data/seidel/seidel_10pct.h5", "stars", ("field_index",))
+    simulation = part(SIMULATION, config.model_dump())
+    product = read_product(Path(results) / STARS["dataset3"], "stars", ("field_index",))
     fields = np.isin(np.arange(121), product["field_index"])
     stars, fresh = (
-        FreshStars.simulate(simulation, n, m, fields) for n, m in ((0, STARS), (1, 4000))
+        FreshStars.simulate(simulation, n, m, fields) for n, m in ((0, STAR_COUNT), (1, 4000))
     )
-    rng, levels = np.random.default_rng(0), np.array(config.noise.levels)
+    with Path(out).open("w", newline="") as file:
+        levels = [f"mse_{level:g}" for level in config.noise.levels]
+        writer = csv.writer(file)
+        writer.writerow(
+            ["architecture", "optimiser", "lr", "cpu_s", "steps", *levels, "over_least"]
+        )
+        for name, optimiser, lr in TRAININGS:
+            torch.manual_seed(0)
+            steps = make_optimiser(network := ARCHITECTURES[name](), optimiser, lr)
+            for row in train(network, steps, lr, float(seconds), (config, stars, fresh)):
+                writer.writerow([name, optimiser, lr, *row])
+                file.flush()
+
+
+def train(network, steps, lr, seconds, source):
+    """Train for some CPU seconds, and yield time, steps and errors on the way."""
+    config, stars, fresh = source
+    noise, rng = noise_model(config), np.random.default_rng(0)
+    levels, least = np.array(config.noise.levels), read_least_errors("dataset3").value
     # The linear estimate, and the stars on which errors are measured.
     statistics = measure_statistics(stars.draw(40_000, rng), levels, config.grid.points)
     mean, axes, variance = (
@@ -206,8 +238,6 @@ def main(results, architecture, optimiser, seconds, lr):  # noqa: PLR0915
     )
     truth = fresh.draw(4096, rng)[0]
     tests = [noise.draw(truth, level, rng) for level in levels]
-    network = ARCHITECTURES[architecture]()
-    weights, steps = [*network.parameters()], make_optimiser(network, optimiser, lr)
 
     def restore(noisy, level):
         sky = ((noise.kappa * level) ** 2 + noise.kappa * level / 100 / SIDE**2)[:, None]
@@ -220,14 +250,15 @@ def main(results, architecture, optimiser, seconds, lr):  # noqa: PLR0915
         return mean + (variance / total * deviation + correction) @ axes.T
 
     @torch.inference_mode()
-    def report(clock, step):
+    def measure():
         errors = []
         for level, noisy in zip(levels, tests, strict=True):
             psf = restore(torch.from_numpy(noisy), torch.full((len(noisy),), float(level)))
             errors.append(float(((psf.numpy() - truth) ** 2).mean()))
-        row = (architecture, optimiser, f"{clock:.0f}", step, *(f"{e:.4g}" for e in errors))
-        print(*row, sep=",", flush=True)
+        ratio = np.exp(np.mean(np.log(errors / least[levels].to_numpy())))
+        return [*(f"{error:.4g}" for error in errors), f"{ratio:.3f}"]
 
+    weights = [*network.parameters()]
     start, paused, step, latest, report_s = time.process_time(), 0.0, 0, None, 20.0
     while (clock := time.process_time() - start - paused) < seconds:
         done = clock / seconds
@@ -249,11 +280,11 @@ def main(results, architecture, optimiser, seconds, lr):  # noqa: PLR0915
         step += 1
         if clock > report_s:
             pause = time.process_time()
-            report(clock, step)
+            yield [f"{clock:.0f}", step, *measure()]
             report_s *= 1.6
             paused += time.process_time() - pause
-    report(seconds, step)
+    yield [f"{seconds:.0f}", step, *measure()]
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4], *map(float, sys.argv[4:6]))
+    main(*sys.argv[1:])

@@ -36,11 +36,14 @@ from psfdae_paper.source import cpu_model, git
 IMAGE_COSTS = ("tables/benchmark_images.csv", "figures/benchmark/images.png")
 """Files of `make benchmark TARGETS=images`, which names date and commit in its table."""
 
-NETWORK_COSTS = ("tables/posterior_network.csv", "figures/benchmark/posterior_network.png")
-"""Files of `snakemake posterior_network`."""
+METHOD_COSTS = (
+    *("tables/benchmark_costs.csv", "figures/benchmark/costs.png"),
+    *("tables/posterior_network.csv", "figures/benchmark/posterior_network.png"),
+)
+"""Files of the target `posterior_network`, which times all methods."""
 
 MAY_STAY = re.compile(
-    "|".join([r"(sweeps|paper)/.+", *map(re.escape, (*IMAGE_COSTS, *NETWORK_COSTS))])
+    "|".join([r"(sweeps|paper)/.+", *map(re.escape, (*IMAGE_COSTS, *METHOD_COSTS))])
 )
 """Names of files that may stay from an earlier record, because they take too long to compute."""
 
