@@ -38,6 +38,7 @@ class StarKeywords(ImageKeywords, total=False):
     """Keywords of `Stars.from_image`: options of the image, and settings of stars and stamps.
 
     The settings are explained in `psfdae.base.settings`: `CalibrationStars`, `Stamp` and `Parts`.
+    `seed` is the seed of all random numbers.
     """
 
     snr_min: float | None
@@ -104,6 +105,11 @@ class Stars(ImageStars):
             Options of the image (`psfdae.image.image_input.ImageOptions`), such as `gain=1.5` or
             `detect=True`, which may be the threshold in σ; or settings of stars and stamps
             (`StarKeywords`), such as `snr_min=50` or `stamp_px=24`.
+
+        Returns
+        -------
+        Stars
+            All stars of the list with their verdicts, and the images of the good ones.
 
         Raises
         ------
@@ -202,6 +208,11 @@ class PsfModel(StarModel):
         name : str, optional
             Name of the new model, by default the image's.
 
+        Returns
+        -------
+        PsfModel
+            Model of the exposure; this one is unchanged.
+
         Raises
         ------
         Error
@@ -272,6 +283,16 @@ class PsfModel(StarModel):
         **options
             Options of the image (`psfdae.image.image_input.ImageOptions`), such as `gain=1.5` or
             `detect=True`.
+
+        Returns
+        -------
+        CCDData
+            Image in its own unit, with its WCS.
+
+        Raises
+        ------
+        Error
+            As `photometry`.
         """
         source = ImageInput.build(image, {**options, "catalogue": catalogue})
         return measure_all_stars(self, source).residual

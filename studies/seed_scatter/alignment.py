@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 
 from psfdae.base.files import read_product
+from psfdae.methods.dae import Dae
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.evaluation.alignment_tables import tabulate_errors
@@ -48,7 +49,7 @@ def train(data: Path, seed: int, folder: Path) -> None:
 def measure(data: Path, folder: Path) -> list[dict]:
     """Measure the networks on the noisy stamps of the workflow, whose seed stays the same."""
     config = load_stage(("seed", "noise", "evaluation"), Alignment.choice)
-    rows = []
+    dae, rows = Dae.load(folder / "dae", evaluation=config.evaluation), []
     for test_set in ("uniform", "grid"):
         product = read_product(
             data / f"{test_set}.h5", "alignment_states", ("states", "stamps", "unit")
@@ -57,7 +58,7 @@ def measure(data: Path, folder: Path) -> list[dict]:
         for level in config.noise.levels:
             stamps = draw_test_stamps(config, product["stamps"], test_set, level)
             estimates = {kind: predict[kind](stamps) for kind in NETWORKS}
-            estimates["dae"] = predict["original"](denoise(folder / "dae", config, stamps))
+            estimates["dae"] = predict["original"](denoise(dae, stamps))
             for method, states in estimates.items():
                 key = {"test_set": test_set, "noise_level": level, "method": method}
                 rows += tabulate_errors(key, states - product["states"], product["unit"])

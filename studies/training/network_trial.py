@@ -19,31 +19,41 @@ import numpy as np
 import pandas as pd
 
 from psfdae.base.files import read_product
-from psfdae.commands.cli import main as psfdae
+from psfdae.methods.dae import Dae
 from psfdae_paper.configuration.alignment import Alignment
-from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.configuration.estimators import ESTIMATORS
 from psfdae_paper.source import git_commit
-from psfdae_paper.stages.alignment_methods import denoise, draw_test_stamps, load_predictor
+from psfdae_paper.stages.alignment_methods import (
+    denoise,
+    draw_test_stamps,
+    load_predictor,
+    network_groups,
+    train_network,
+)
 
 
 def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None:
     """Train, measure, append."""
     root = Path(results)
     states, dae = root / "data/alignment", root / "alignment/dae"
-    dae_option = [f"--dae={dae}"] * ESTIMATORS[kind].uses_dae
-    config = load([*Alignment.choice, *overrides])
+    words = [*Alignment.choice, *overrides]
+    config, settings = load(words), load_stage(network_groups(kind), words)
     test = read_product(states / "uniform.h5", "alignment_states", ("states", "stamps"))
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["alignment", "train-network", "--kind", kind, "--out", folder, *dae_option]
-        words += ["--states", f"{states}/train.h5", "--checkpoint", f"{folder}/checkpoint.pt"]
+    network = None
+    if ESTIMATORS[kind].uses_dae:
+        network = Dae.load(dae, evaluation=config.evaluation)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         started = time.process_time()
-        psfdae([*words, *overrides], standalone_mode=False)
+        train_network(
+            settings, kind, states / "train.h5", folder / "checkpoint.pt", folder, network and dae
+        )
         seconds = time.process_time() - started
-        predict, rows = load_predictor(Path(folder), test, config), []
+        predict, rows = load_predictor(folder, test, config), []
         for level in config.noise.levels:
             noisy = draw_test_stamps(config, test["stamps"], "uniform", level)
-            inputs = denoise(dae, config, noisy) if ESTIMATORS[kind].uses_dae else noisy
+            inputs = denoise(network, noisy) if network else noisy
             error = np.abs(predict(inputs) - test["states"]).mean()
             row = dict(network=kind, trial=trial, settings=" ".join(overrides))
             row |= dict(noise_level=level, mean_abs_error=error, cpu_s=seconds)

@@ -123,6 +123,21 @@ def test_versions_agree():
     assert re.search(r"^## (\S+)", read("CHANGELOG.md"), re.M)[1] == psfdae.__version__
 
 
+def test_files_that_the_guide_for_contributors_names_exist():
+    """A file without a folder is in the folder of the file before it."""
+    rows = [row for row in read("CONTRIBUTING.md").splitlines() if row.startswith("| ")]
+    names = [re.findall(r"`(\w[\w/]*(?:/|\.py))`", row) for row in rows]
+    assert sum(map(len, names)) > 50
+    for row in names:
+        folder = ""
+        for name in row:
+            folder = name[: name.rindex("/") + 1] if "/" in name else folder
+            path = f"{folder}{name.rpartition('/')[2]}"
+            # Rows of what to add have folders of either package.
+            places = ("src/psfdae", "src", "src/psfdae/image")
+            assert any((ROOT / place / path).exists() for place in places), path
+
+
 def anchors(page):
     """Anchors of the headings of a page, as GitHub makes them."""
     # A comment in a code block is no heading.

@@ -272,6 +272,25 @@ def test_our_rules_are_found_by_their_names():
     assert not datasets.list_datasets_except(names)
 
 
+def test_rules_made_from_local_rules_are_local():
+    """Snakemake inherits all of a rule but `localrule`: a cluster would get a job of seconds."""
+    text = "\n".join(path.read_text(encoding="utf-8") for path in rule_files())
+    rules = re.compile(
+        r"^rule (?P<name>\w+):\n(?P<body>(?:(?: +.*)?\n)*)"
+        r"|^use rule (?P<origin>\w+) as (?P<copy>\w+) with:\n(?P<copy_body>(?:(?: +.*)?\n)*)",
+        re.MULTILINE,
+    )
+    origins, local_rules = {}, set()
+    for rule in rules.finditer(text):
+        name = rule["name"] or rule["copy"]
+        origins[name] = rule["origin"]
+        if "    localrule: True\n" in (rule["body"] or rule["copy_body"]):
+            local_rules.add(name)
+    assert {origin for origin in origins.values() if origin} <= origins.keys()
+    copies = [name for name, origin in origins.items() if origin in local_rules]
+    assert len(copies) > 3 and [name for name in copies if name not in local_rules] == []
+
+
 @pytest.mark.parametrize("prefix", ["", "psfdae_"])
 def test_rules_of_a_module_are_known_by_their_own_names(prefix):
     """A dataset called as the end of another rule has no rule yet."""

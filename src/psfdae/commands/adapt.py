@@ -37,7 +37,7 @@ def adapt_command(
     model : Path
         Model of train --method field, of another exposure.
     out : Path
-        Bundle of IMAGE, by custom NAME.psf.safetensors.
+        Model of IMAGE, usually NAME.psf.safetensors.
     """
     # Refuse wrong options and files that exist before anything is computed.
     source = ImageInput(image, **vars(options))

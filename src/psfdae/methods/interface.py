@@ -1,10 +1,9 @@
-"""Base class of methods, which restore the PSF of a star from its noisy image.
+"""Base class of methods, which estimate the PSF of a star from its noisy image.
 
 Each method is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its
-settings; files with other values are `config/<group>/default.yaml`. The list `methods` of
-`config/config.yaml` names the methods of the reproduction. Rules, tables, figures, sweeps, runs of
-MLflow, bundles and `train` get all information from the classes: label and colour, inputs,
-files of a fit, and form in a bundle.
+settings; `config/config.yaml` has their values for the reproduction, and a list `methods` of the
+names of its methods. Rules, tables, figures, sweeps, runs of MLflow, bundles and `train` get all
+information from the classes: label and colour, inputs, files of a fit, and form in a bundle.
 
 A method has at least `look`, `fit` and `predict`; the base class has defaults for the rest. A
 method with a product lists its arrays in `storage`. All methods are called by `estimate`; a method
@@ -286,8 +285,9 @@ class Method:
         Groups of the configuration with its settings; `fit` gets them by name.
     knows_field : bool
         True if it has a model of the PSF at every position in the field, with which it measures
-        flux, sky and centre of a star together with its PSF. It has `measure`, `psf_at`, `order`
-        and `draw_stars`, and is trained on `TrainingSet.bright`.
+        flux, sky and centre of a star together with its PSF. It has `measure`, `psf_at`, `order`,
+        `draw_stars`, `estimate_flux_error` and `is_outside_range`, and is trained on
+        `TrainingSet.bright`.
     assumes_independent_pixels : bool
         True if its likelihood is a product over pixels. With the noise of interpolated pixels its
         PSFs are not the best possible, and its standard deviations do not hold.

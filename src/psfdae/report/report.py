@@ -63,11 +63,11 @@ class Report:
     per_star : Table
         Every metric of every image; `star` numbers the images, `field` their stars.
     photometry : Table
-        Photometry by S/N: what `predict` makes of the held-out images where no flux, sky, noise
-        and centre is given. Part of the stars without a usable flux (`lost`), relative bias of the
-        flux, its pull (what 68.27 % of |error| over the standard error are below: 1 if errors
-        hold), RMS error of the centre in px, and coverage of fluxes, centres and pixels: the parts
-        that are within their predicted errors, with standard errors clustered by star.
+        Photometry of the held-out images by S/N, as by `predict` without given flux, sky, noise and
+        centre. Fraction of the stars without a usable flux (`lost`), relative bias of the flux, its
+        pull (68.27 % percentile of |error| over the standard error: 1 if errors hold), RMS error of
+        the centre in px, and coverage of fluxes, centres and pixels: the fractions that are within
+        their predicted errors, with standard errors clustered by star.
     restored : dict
         By noise level λ the held-out images (n, d, d): degraded (`noisy`), bright (`truth`), and
         restored by the model (`model`) and by one mean PSF (`mean_psf`).

@@ -48,6 +48,11 @@ def validate(
     further_fits : mapping of str to Method, optional
         Fits of other methods to these stars, by name, for the table.
 
+    Returns
+    -------
+    Report
+        Errors by method and S/N, photometry, checks and figures.
+
     Raises
     ------
     Error

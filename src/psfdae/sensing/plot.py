@@ -48,7 +48,7 @@ def wavefront_map(wavefronts: Wavefronts, title: str) -> Figure:
     panels = (
         ("measured", star_opd, peak, "RdBu_r", "OPD (waves)"),
         (model_name, model, peak, "RdBu_r", "OPD (waves)"),
-        ("residuals of the stars", residual, 4.0, "Greys", "noise of the sky"),
+        ("residuals of the stars", residual, 4.0, "Greys", "residual / noise of the sky"),
     )
     # Three panels over the field.
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")

@@ -141,7 +141,8 @@ def draw_field(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> Fig
     fwhm_axes = figure.add_subplot(grid[1, 1])
     _draw_map(fwhm_axes, fields, fields.table.fwhm_arcsec.to_numpy(), "cividis", "FWHM (arcsec)")
     # Spacing of the field points in the unit of the axes, for the length of the whiskers.
-    position, _ = to_field_unit(fields.field)
+    position, unit = to_field_unit(fields.field)
+    fwhm_axes.set_xlabel(f"x ({unit})")
     points = int(fields.grid[:, 0].max()) + 1
     spacing = float(np.ptp(position[:, 0])) / (points - 1) if points > 1 else 1.0
     angle = np.deg2rad(fields.table.position_angle_deg.to_numpy())

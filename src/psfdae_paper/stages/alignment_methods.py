@@ -248,33 +248,25 @@ def denoise_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> 
             noisy = data.noise.draw(data.stamps[part], level[part], rng)
             # Errors of the states are the same as in single precision (studies/training).
             with use_half_precision():
-                draw[part] = dae.predict(_single_stamps(noisy)).reshape(noisy.shape)
+                draw[part] = denoise(dae, noisy)
     return replace(data, stamps=dae_stamps, noise=None)
 
 
-def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
+def denoise(dae: Dae, stamps: np.ndarray) -> np.ndarray:
     """Apply a trained DAE to stamps (n, F, d, d); it neither clips nor renormalises them.
 
     Parameters
     ----------
-    dae : Path
-        Folder of `alignment train-dae`.
-    config : Config
-        Its group `evaluation` has the number of threads, and of images at a time.
+    dae : Dae
+        Network of `alignment train-dae`.
     stamps : ndarray, shape (n, F, d, d)
         Noisy stamps of sum 1.
 
     Returns
     -------
     ndarray, shape (n, F, d, d), float32
-
-    Raises
-    ------
-    ProductError
-        If the network in the folder `dae` is missing or damaged.
     """
-    network = Dae.load(dae, evaluation=config.evaluation)
-    return network.predict(_single_stamps(stamps)).reshape(stamps.shape)
+    return dae.predict(_single_stamps(stamps)).reshape(stamps.shape)
 
 
 def _single_stamps(stamps: np.ndarray) -> np.ndarray:
@@ -405,6 +397,8 @@ def estimate(
     limit_threads(config.evaluation.threads)
     product = read_states(states)
     require_origin(dae, Alignment.stamp_keys, product)
+    # All networks are loaded before any is timed.
+    dae_network = Dae.load(dae, evaluation=config.evaluation)
     predict = {
         name: load_predictor(folder, product, config, name)
         for name, folder in vars(networks).items()
@@ -418,7 +412,7 @@ def estimate(
         noisy = draw_test_stamps(config, product["stamps"], test_set, level)
         # The DAE's output, the input of several networks, and its run time.
         start_s = time.perf_counter()
-        dae_psf = denoise(dae, config, noisy)
+        dae_psf = denoise(dae_network, noisy)
         denoising_seconds = time.perf_counter() - start_s
         # Each network, with the stamps that it was trained for.
         for column, method in enumerate(methods):

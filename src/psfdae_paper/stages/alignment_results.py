@@ -21,6 +21,7 @@ from psfdae.base.files import Product, ProductError, read_product, write_csv
 from psfdae.base.options import File, Folder
 from psfdae.base.reading import read_table
 from psfdae.base.threads import limit_threads
+from psfdae.methods.dae import Dae
 from psfdae.training.star_sets import noise_model
 from psfdae_paper.alignment.likelihood import compute_mean_abs_error
 from psfdae_paper.alignment.stamps import AlignmentStamps
@@ -306,12 +307,13 @@ def figure_stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) 
     # The DAE must be trained on stamps of this telescope.
     product = read_states(states)
     require_origin(dae, Alignment.stamp_keys, product)
+    network = Dae.load(dae, evaluation=config.evaluation)
     # The first two states, with the noise that they have in the test set.
     rows = [("noise-free", product["stamps"][:2])]
     for level in config.noise.levels:
         # Noise is drawn for the whole set, so that these two have the noise of the tables.
         noisy = draw_test_stamps(config, product["stamps"], "uniform", level)[:2]
-        rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(dae, config, noisy))]
+        rows += [(f"λ = {level:g}", noisy), ("DAE", denoise(network, noisy))]
     titles = [
         "decentre ({:+.2f}, {:+.2f}), tilt ({:+.2f}, {:+.2f}) of the range".format(*state)
         for state in product["states"][:2]
