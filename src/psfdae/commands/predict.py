@@ -110,7 +110,7 @@ def predict_command(
     try:
         # The FITS file gets its name last: if it exists, everything is done.
         with rename_together(out), atomic_path(out) as temporary_path:
-            flag_counts, unflagged_count, list_note = write_prediction(
+            flags, list_note = write_prediction(
                 denoiser, source, observation, temporary_path, threads, fixed_positions
             )
             if list_path is not None:
@@ -121,11 +121,10 @@ def predict_command(
         name = error.filename or out
         raise PredictionError(f"{name}: cannot be written ({error.strerror or error})") from error
     # Summary: the image, its list, what limits the trust in the model, and the flags.
-    unlike_count = int(flag_counts[[*StarFlag].index(StarFlag.UNLIKE_TRAINING)])
-    lines = [observation.summary(), list_note, *notes_on_model(denoiser, observation, unlike_count)]
-    lines.append(f"{out}: {observation.count} stars, {unflagged_count} without a flag")
-    counts_by_flag = zip(StarFlag, flag_counts, strict=True)
-    lines += [f"  {flag.name}: {count}" for flag, count in counts_by_flag if count]
+    lines = [observation.summary(), list_note, *notes_on_model(denoiser, observation, flags)]
+    lines.append(f"{out}: {observation.count} stars, {(flags == 0).sum()} without a flag")
+    counts_by_flag = [(flag.name, np.count_nonzero(flags & int(flag))) for flag in StarFlag]
+    lines += [f"  {name}: {count}" for name, count in counts_by_flag if count]
     summary = "\n".join(line for line in lines if line)
     print(summary)
     return summary
@@ -192,15 +191,13 @@ def write_prediction(
     out: Path,
     threads: int | None,
     fixed_positions: bool,
-) -> tuple[np.ndarray, int, str | None]:
+) -> tuple[np.ndarray, str | None]:
     """Restore the stars in pieces and write them to a FITS file.
 
     Returns
     -------
-    flag_counts : ndarray of int, shape (flags,)
-        Number of stars with each `StarFlag`.
-    unflagged_count : int
-        Number of stars without any flag.
+    flags : ndarray of int, shape (n,)
+        Sums of the `StarFlag` of all stars.
     list_note : str or None
         A sentence on how far the stars are off the positions of their list.
 
@@ -212,8 +209,7 @@ def write_prediction(
     # The first stars give the types of the columns.
     pieces = model.stream(observation, threads, fixed_positions)
     first_piece = next(pieces)
-    flag_counts = np.zeros(len(StarFlag), dtype=int)
-    star_index, unflagged_count, offsets = 0, 0, []
+    star_index, flags, offsets = 0, [], []
     # Header cards: the file, its pixel scale, the star list, and what is known of the detector.
     scale_note = ", assumed" if observation.scale_assumed else ""
     catalogue = None if observation.catalogue is None else observation.catalogue.name
@@ -232,12 +228,11 @@ def write_prediction(
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
     header = (first_piece[1], observation.count, cards, history)
     with prediction_file(out, model.bundle, *header) as file:
-        # Rows of the file, the number of stars with each flag, and distances to the list.
+        # Rows of the file, flags of the stars, and distances to the list.
         for stamps, prediction in itertools.chain([first_piece], pieces):
             file.write(star_index, prediction)
-            flag_counts += [(prediction.flags & int(flag) > 0).sum() for flag in StarFlag]
-            unflagged_count += int((prediction.flags == 0).sum())
+            flags.append(prediction.flags)
             offsets.append(offsets_from_list(stamps, prediction, model.margin_px))
             star_index += len(prediction)
         note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
-    return flag_counts, unflagged_count, note if isinstance(observation, Image) else None
+    return np.concatenate(flags), note if isinstance(observation, Image) else None

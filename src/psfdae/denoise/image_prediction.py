@@ -19,7 +19,7 @@ from psfdae.image.image_input import ImageInput
 from psfdae.image.observation import Observation
 from psfdae.image.opening import open_observation
 from psfdae.image.positions import list_offset
-from psfdae.image.stamps import Stamps, StarFlag
+from psfdae.image.stamps import Stamps, StarFlag, find_unlike_stars
 from psfdae.psf.interface import PredictionError
 
 CAUSES = "an image that is turned, of another part of the detector, or of another PSF?"
@@ -59,8 +59,7 @@ def predict_stars(
     offset_note = list_offset(observation.catalogue, np.concatenate(offsets), source.accept_offset)
     notes = [observation.summary(), offset_note if isinstance(observation, Image) else None]
     prediction = Prediction.joined(predictions)
-    unlike_count = int(np.count_nonzero(prediction.flags & int(StarFlag.UNLIKE_TRAINING)))
-    notes += notes_on_model(model, observation, unlike_count)
+    notes += notes_on_model(model, observation, prediction.flags)
     return replace(prediction, notes=tuple(filter(None, notes)))
 
 
@@ -88,19 +87,20 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
     return observation
 
 
-def notes_on_model(model: StarModel, observation: Observation, unlike_count: int) -> list[str]:
+def notes_on_model(model: StarModel, observation: Observation, flags: np.ndarray) -> list[str]:
     """Return warnings about limits of the predictions for an image.
 
     They concern a frame or instrument other than the training image's, stars unlike the training
-    stars (`unlike_count` is their number), and light outside the stamps.
+    stars by the `flags` (n,) of all stars, and light outside the stamps.
     """
     notes = model.to_image_frame(observation)[1]
     # Another telescope, camera or filter, if both headers name it.
     if difference := other_instrument(model, observation):
         notes.append(f"{observation.path}: {difference}")
     # Of stars like the training stars, 0.1 % have this flag.
+    unlike_count = int(find_unlike_stars(flags).sum())
     if unlike_count >= max(3, 0.1 * observation.count):
-        fraction = f"{unlike_count} of {observation.count} stars are flagged UNLIKE_TRAINING"
+        fraction = f"{unlike_count} of {observation.count} stars are unlike the training stars"
         notes.append(f"{observation.path}: {fraction}: {CAUSES}")
     if isinstance(observation, Image) and model.method.knows_field and not model.wings:
         notes.append(

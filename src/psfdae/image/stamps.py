@@ -134,6 +134,21 @@ def raise_flag(flags: np.ndarray, flag: StarFlag, stars: np.ndarray | np.bool) -
     flags[stars] |= np.uint16(flag)
 
 
+def find_unlike_stars(flags: np.ndarray) -> np.ndarray:
+    """Return True for stars that are unlike the training, and not for the light of a neighbour.
+
+    A brighter pixel off the middle (`OFF_CENTRE`) shows a neighbour, or a position without a star.
+    Stars of a turned image or of another PSF are centred.
+
+    Parameters
+    ----------
+    flags : ndarray of int, shape (n,)
+        Sums of `StarFlag`.
+    """
+    both = int(StarFlag.UNLIKE_TRAINING | StarFlag.OFF_CENTRE)
+    return np.asarray((flags & both) == int(StarFlag.UNLIKE_TRAINING))
+
+
 # Cutting stamps out of an image.
 
 LARGEST_POSITION_PX = 2**30

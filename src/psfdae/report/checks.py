@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from psfdae.base.types import Table
-from psfdae.image.stamps import StarFlag, cut
+from psfdae.image.stamps import cut, find_unlike_stars
 from psfdae.methods import method as method_of
 from psfdae.stars.moments import measure_shapes, shift_stamps
 
@@ -221,6 +221,6 @@ def check_stars(stars: Mapping[str, np.ndarray]) -> list[Check]:
         is_passed = all(0.8 < median < 1.3 for median in medians)
         checks.append((question, ", ".join(answers), is_passed))
     # The model does not suit an image where a tenth of the stars or more are outliers.
-    outlier_fraction = float(((stars["flags"] & int(StarFlag.UNLIKE_TRAINING)) > 0).mean())
+    outlier_fraction = float(find_unlike_stars(stars["flags"]).mean())
     answer = f"{100 * outlier_fraction:.0f} % of the list"
     return [*checks, ("Stars unlike the training", answer, outlier_fraction < 0.1)]

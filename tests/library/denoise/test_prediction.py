@@ -11,7 +11,7 @@ from prediction_stars import KAPPA, SKY, observe
 from psfdae import PredictionError, StarFlag
 from psfdae.denoise import denoiser as restoration
 from psfdae.denoise.prediction import CUBES
-from psfdae.image.stamps import cut
+from psfdae.image.stamps import cut, find_unlike_stars
 from psfdae.methods.interface import Packing
 
 
@@ -303,6 +303,14 @@ def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs
     spike[:, 8, 8] = 1.0
     assert has(shipped.predict(observe(spike, 1e-3).stamps), unlike_flags).all()
     assert has(clean, unlike_flags).mean() < 0.02
+
+
+def test_a_neighbour_does_not_make_a_star_unlike_the_training():
+    """An image of the training itself has stars beside brighter ones; a turned one has others."""
+    unlike, neighbour = StarFlag.UNLIKE_TRAINING, StarFlag.OFF_CENTRE
+    flags = [0, unlike, unlike | neighbour, neighbour, unlike | StarFlag.OUTLIER | StarFlag.FAINT]
+    is_unlike = find_unlike_stars(np.array([int(flag) for flag in flags], np.uint16))
+    assert is_unlike.tolist() == [False, True, False, False, True]
 
 
 def test_a_model_without_a_field_has_no_range_of_magnitudes(shipped):
