@@ -258,6 +258,21 @@ def costs() -> pd.DataFrame:
     )
 
 
+def posterior_networks() -> pd.DataFrame:
+    """CPU time and error of networks on simulated stars, beside other methods as configured."""
+    table = read_record("tables/posterior_network.csv").sort_values(["dataset", "fit_cpu_s"])
+    table = table[(table.point == "configured") | table.method.str.startswith("posterior_network")]
+    epochs = table.point.str.extract(r"epochs(\d+)", expand=False)
+    settings = (", epochs: " + epochs).fillna("")
+    return formatted(
+        table.assign(label=label_methods(table.method) + settings, ms=1e3 / table.stars_per_s),
+        dataset="{dataset}",
+        method="{label}",
+        **{"fit, s": "{fit_cpu_s:.1f}", "a star, ms": "{ms:.3g}"},
+        MSE_over_the_bound="{over_least:.2f} ± {over_least_stderr:.2f}",
+    )
+
+
 def trainings() -> pd.DataFrame:
     """CPU time and error of trainings of the DAE in dataset 3."""
     table = read_record("tables/benchmark_costs.csv").query("method == 'dae'")
@@ -592,7 +607,7 @@ TABLES: dict[str, Callable[[], pd.DataFrame]] = {
         for function in (
             *(paper_preset, all_errors, optics, denoisers, seed_scatters),
             *(alignment_errors, alignment_correlations),
-            *(costs, trainings, image_costs, propagators, stages, flux_errors),
+            *(costs, posterior_networks, trainings, image_costs, propagators, stages, flux_errors),
             *(own_stars, real_image, real_image_ratios, poppy_stars, coverage, outliers),
             *(night_cost, calibration, paper_columns, pixel_scales, held_out_fields, paper_rows),
             *(posterior_means, efficiencies, image_options),

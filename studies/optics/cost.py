@@ -1,6 +1,6 @@
 """CPU time per star against error, of the optics at several efforts and of the other methods.
 
-    python studies/optics/cost.py RESULTS OUT.csv OUT.png
+    python studies/optics/cost.py RESULTS OUT.csv
 
 RESULTS is the folder of a run with `results/evaluation/dataset3/random-realisation.csv` and the
 target `wavefront`. Dataset 3, λ = 0.001, reference realisation, test stars of the error bounds, one
@@ -44,8 +44,8 @@ EFFORTS = (
 """Fields (without the field) or offsets (in it) from whose best matches modes are sought."""
 
 
-def main(results: Path, out: Path, picture: Path) -> None:
-    """Measure, and draw."""
+def main(results: Path, out: Path) -> None:
+    """Write a row for each method and effort."""
     limit_threads(1)
     config = load([f"dataset={DATASET}"])
     name = config.stars.name
@@ -95,37 +95,7 @@ def main(results: Path, out: Path, picture: Path) -> None:
     ).stdout.strip()
     table = pd.DataFrame(rows).assign(date=date.today().isoformat(), commit=commit)
     table.to_csv(out, index=False, float_format="%.5g")
-    draw(table, picture)
-
-
-def draw(table: pd.DataFrame, picture: Path) -> None:
-    """Every method a point, the optics a line of efforts."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7.0, 4.4), layout="constrained")
-    for name, rows in table.groupby("method", sort=False):
-        look = method(name).look
-        axes.errorbar(
-            rows.ms_per_star,
-            rows.mse,
-            yerr=rows.stderr,
-            color=look.color,
-            marker=look.marker,
-            ms=8,
-            lw=1.4,
-            capsize=2,
-            label=look.label,
-        )
-    axes.set(xscale="log", yscale="log", xlabel="CPU time per star in ms, one thread")
-    axes.set_ylabel("MSE per pixel (stamp sum = 1)")
-    axes.set_title(f"{DATASET}, λ = {LEVEL:g}: cost against error")
-    axes.grid(True, which="major", alpha=0.4)
-    axes.legend(fontsize=8)
-    figure.savefig(picture, dpi=130)
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:4]))
+    main(*map(Path, sys.argv[1:3]))
