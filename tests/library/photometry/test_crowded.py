@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
 from image_training import few_draws
-from psfdae import PsfModel, Stars, load_model
+from psfdae import Error, PsfModel, Stars, load_model
 from psfdae.base.files import read_product
 from psfdae.denoise.bundle import BundleError
 from psfdae.image.camera import CameraValue
@@ -435,6 +435,26 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     )
     ratio = (measured["flux"] / true["flux"][:25])[:24][~true["pair"][:24]]
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("call", [PsfModel.photometry, PsfModel.residual])
+@pytest.mark.parametrize(
+    ("moved", "message"),
+    [
+        (lambda place: place[:, ::-1], "x and y exchanged"),
+        (lambda place: place + np.array([2.0, -3.0]), "a list of another image"),
+        (lambda place: place + 1.0, "origin=1"),
+    ],
+)
+def test_a_list_of_another_image_or_origin_is_refused_unless_it_is_accepted(
+    sky, call, moved, message
+):
+    folder, path, true = sky
+    place = np.stack([true["x"], true["y"]], axis=1)[~true["pair"]]
+    model, image = load_model(path), folder / "i.fits"
+    with pytest.raises(Error, match=message):
+        call(model, image, catalogue=moved(place))
+    call(model, image, catalogue=moved(place), accept_offset=True)
 
 
 def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighbours(sky):
