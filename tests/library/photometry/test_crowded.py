@@ -565,6 +565,32 @@ def test_wings_and_sky_settle_in_two_fits(monkeypatch):
     assert 2 <= fit_count <= 3 and abs(wings.light()[0] - light) < 0.3 * error
 
 
+@pytest.mark.parametrize("ratio", [(0.64, 0.0), (0.7, -0.3), (0.5, 0.5), (-0.4, 0.0)])
+def test_wings_and_sky_settle_where_the_answer_of_the_sky_changes(monkeypatch, ratio):
+    """Turns reach the fixed point of F(x), whose slope ρ changes once x is nearer to it.
+
+    A ρ of the first turns that was kept let the following ones diverge: all fluxes were too large
+    by many of their errors.
+    """
+    stars = StarFluxes(np.array([[50.0, 50.0]]), np.array([1e4]), np.array([0.03]))
+    unit = Wings(RADIUS, np.geomspace(2e-4, 7e-5, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    light = unit.light()[0]
+    unit = replace(unit, covariance=np.eye(len(RADIUS)) * (light / unit.light()[1]) ** 2)
+
+    def answer(*args):
+        # In units of the fixed point, with an error of 1: slope ρ₁ below the knee, ρ₂ from there.
+        distance, knee = args[5].light()[0] / light - 1.0, -0.15
+        change = ratio[1] * max(distance, knee) + ratio[0] * min(distance - knee, 0.0)
+        return replace(unit, profile=unit.profile * (1.0 + change))
+
+    monkeypatch.setattr(wings_fit, "fit_wings", answer)
+    image = np.random.default_rng(3).normal(300.0, 15.0, (100, 100))
+    sky, nothing = subtract_sky(image, np.zeros(image.shape, bool)), np.zeros(image.shape)
+    start = replace(unit, profile=0.6 * unit.profile)
+    args = image, sky, sky.noise, nothing, stars, 10, start, 0.02, np.empty((0, 3))
+    assert around_stars(*args)[2].light()[0] / light == pytest.approx(1.0, abs=0.04)
+
+
 @pytest.mark.parametrize("distance", [9, 60])
 def test_wings_of_a_star_on_saturated_cores_without_halos_are_subtracted_once(distance):
     """Nothing is left of them, and they are in the map of the light, for one core or two."""
