@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.base.errors import keyword
+from psfdae.image.containers import split_array
 from psfdae.image.errors import ObservationError, reading
 from psfdae.image.fits_file import (
     SCIENCE,
@@ -238,7 +239,7 @@ def _find_layer(image: ImageFile, option: Any, role: str) -> ImageFile:
     image : ImageFile
         The image.
     option : str, int, Path or ndarray
-        Extension of the image's file, another file, or an array.
+        Extension of the image's file, another file, or an array, whose masked values are NaN.
     role : str
         Words for the layer, for messages.
 
@@ -255,7 +256,10 @@ def _find_layer(image: ImageFile, option: Any, role: str) -> ImageFile:
     if image.raw is not None and not (is_array or is_file):
         raise ObservationError(image.path, f"{role} of an array is an array, too, or a file")
     if is_array:
-        layer = array_image(np.asarray(option, dtype=np.float64), role)
+        # A masked value is missing, as NaN: its pixel is bad, whatever the number below the mask.
+        values, is_masked, _ = split_array(option)
+        missing = np.where(False if is_masked is None else is_masked, np.nan, 0.0)
+        layer = array_image(values + missing, role)
     else:
         layer = find_image(Path(option)) if is_file else find_image(image.file, option)
     # It has the shape of the image.

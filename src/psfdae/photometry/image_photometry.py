@@ -102,7 +102,8 @@ def measure_all_stars(
     PredictionError
         If the model knows no PSF of a position, or has pixels of another scale.
     ObservationError
-        If the image or a list cannot be used.
+        If the image or a list cannot be used; or if the stars are far off the positions of their
+        list, unless that is accepted.
     """
     # Reject options that do not fit together.
     if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
@@ -141,7 +142,10 @@ def measure_all_stars(
             magnitudes = positions, star_list.numbers(magnitude_column), str(star_list.path)
         # All stars of the image, and the zero point by those that the reference has.
         observation = add_measured_gain(model, observation)
-        star_fit, list_note = measure_stars(model, observation, source.given_threshold)
+        star_fit = measure_stars(model, observation, source.given_threshold)
+    # Reject a list of another image, whose fluxes would be those of the sky and of other stars.
+    offset = offsets_from_list(star_fit, observation)
+    list_note = list_offset(observation.catalogue, offset, source.accept_offset)
     zero_point_note = None
     if magnitudes is not None:
         zero_point, scatter, zero_point_note = measure_zero_point(star_fit, *magnitudes)
@@ -166,7 +170,7 @@ def measure_all_stars(
 
 def measure_stars(
     model: FieldPsfs, observation: Image, threshold: float | None = None, turns: int = 5
-) -> tuple[CrowdedPhotometry, str | None]:
+) -> CrowdedPhotometry:
     """Measure the stars that can be measured, and return a row for every star of the list.
 
     Parameters
@@ -182,10 +186,8 @@ def measure_stars(
 
     Returns
     -------
-    star_fit : CrowdedPhotometry
+    CrowdedPhotometry
         The stars, and the image without them.
-    list_note : str or None
-        A sentence on how far the stars are off the positions of their list, if there is one.
     """
     # A row without a position cannot be fitted, and a star that is listed twice would share its
     # light: measure the others, and add flagged rows for these.
@@ -195,11 +197,32 @@ def measure_stars(
     if unusable.any():
         stars = add_unmeasured_rows(star_fit.stars, observation, unusable)
         star_fit = replace(star_fit, stars=stars)
-    if observation.catalogue is None or len(star_fit.stars) != observation.count:
-        return star_fit, None
-    # The stars are fitted where they are, whatever the list says.
-    offset = np.stack([star_fit.stars["x"], star_fit.stars["y"]], axis=1) - observation.positions
-    return star_fit, list_offset(observation.catalogue, offset, accept=True)
+    return star_fit
+
+
+def offsets_from_list(star_fit: CrowdedPhotometry, observation: Image) -> np.ndarray:
+    """Return the offsets of stars from the positions of their list.
+
+    Parameters
+    ----------
+    star_fit : CrowdedPhotometry
+        Stars of the image.
+    observation : Image
+        The image with the stars of the list.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Along x and y in px; NaN for stars that are faint or without a flux, whose positions noise
+        decides. Without rows where the stars are not those of a list.
+    """
+    # Rows of stars that were detected have no listed position.
+    stars = star_fit.stars
+    if observation.catalogue is None or len(stars) != observation.count:
+        return np.empty((0, 2))
+    offset = np.stack([stars["x"], stars["y"]], axis=1) - observation.positions
+    is_unclear = (np.array(stars["flags"]) & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    return np.where(is_unclear[:, None], np.nan, offset)
 
 
 def light_notes(star_fit: CrowdedPhotometry, source: ImageInput) -> list[str]:

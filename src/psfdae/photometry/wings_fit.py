@@ -395,8 +395,7 @@ def around_stars(
     wings, fitted_stars = earlier, None
     # Each turn finds the sky without the wings so far, of the same structure, then the wings on
     # this sky. The sky of the last turn is off by far less than the error of the wings.
-    changes: list[float] = []
-    growth: float | None = None
+    last_light, last_change = np.nan, np.nan
     for _ in steps("light beyond the stamps", range(8)):
         residual = draw_wings(image.shape, stars, wings)
         np.subtract(without_stars, residual, out=residual)
@@ -416,16 +415,22 @@ def around_stars(
         wings = fit
         # The sky has taken a part of the wings that were not subtracted yet: it gives it back in
         # turns, each a fraction ρ of the turn before. A change δ is followed by δ ρ/(1 − ρ), which
-        # is added at once as soon as two changes have shown ρ; half of that may be wrong.
+        # is added at once; half of that may be wrong. The two latest turns, from x₁ to F(x₁) and
+        # from x₂ to F(x₂), show ρ = (F(x₂) − F(x₁))/(x₂ − x₁), as in the secant method: ρ of the
+        # first turns would let later ones diverge where ρ changes, as around clipped pixels.
         light, light_sigma = wings.light()
-        changes.append(light - (0.0 if previous is None else previous.light()[0]))
-        unknown_light = abs(changes[-1])
-        if len(changes) == 2 and abs(changes[1]) < 0.75 * abs(changes[0]):
-            growth = changes[1] / (changes[0] - changes[1])  # ρ/(1 − ρ)
-        if growth is not None and previous is not None:
+        start_light = 0.0 if previous is None else previous.light()[0]
+        change = light - start_light
+        with np.errstate(all="ignore"):
+            ratio = 1.0 + np.divide(change - last_change, start_light - last_light)
+        last_light, last_change = start_light, change
+        unknown_light = abs(change)
+        if previous is not None and abs(ratio) < 0.75:
+            growth = ratio / (1.0 - ratio)
             unknown_light *= 0.5 * abs(growth)
-            step = wings.profile - previous.profile
-            wings = replace(wings, profile=wings.profile + growth * step)
+            wings = replace(
+                wings, profile=wings.profile + growth * (wings.profile - previous.profile)
+            )
         if previous is not None and unknown_light < tolerance * light_sigma:
             break
     del residual  # of a large image, each map takes much memory

@@ -205,6 +205,6 @@ def measure_wings(model: StarModel, stars: ImageStars) -> list[Wings]:
         if not isinstance(image.observation, Image):
             continue
         observation = add_measured_gain(model, image.observation.assume_scale())
-        photometry, _ = measure_stars(model, observation, image.source.given_threshold, 2)
+        photometry = measure_stars(model, observation, image.source.given_threshold, 2)
         wings += [] if photometry.image_wings is None else [photometry.image_wings]
     return wings

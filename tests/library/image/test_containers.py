@@ -20,6 +20,7 @@ from astropy.nddata import (
     VarianceUncertainty,
 )
 from astropy.table import QTable
+from astropy.utils.masked import Masked
 
 import small_field as small
 from command_line import psfdae, refused
@@ -78,6 +79,17 @@ def test_the_mask_of_a_container_is_that_of_the_keyword(image, place, bad, name)
     expected = verdicts(image, place, mask=bad, **CAMERA)
     assert 0 < expected.count("incomplete") < len(expected) / 2
     assert verdicts(CONTAINERS[name](image, bad), place, **CAMERA) == expected
+
+
+@pytest.mark.parametrize(
+    ("option", "number"), [("error", 5.0), ("variance", 25.0), ("weight", 0.04), ("mask", 0)]
+)
+@pytest.mark.parametrize("kind", [np.ma.MaskedArray, Masked])
+def test_masked_values_of_a_map_are_bad_pixels(image, place, bad, option, number, kind):
+    layer = np.full(image.shape, number)
+    masked = kind(layer, mask=bad)
+    sky = open_observation(ImageInput(image, catalogue=place, **{option: masked}), 16).sky()
+    assert (sky.bad == bad).all()
 
 
 # The four lines of Python: each container, with each kind of list.

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from command_line import printed, psfdae, refused
 from image_training import few_draws
-from psfdae import PsfModel, Stars, load_model
+from psfdae import Error, PsfModel, Stars, load_model
 from psfdae.base.files import read_product
 from psfdae.denoise.bundle import BundleError
 from psfdae.image.camera import CameraValue
@@ -437,6 +437,26 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("call", [PsfModel.photometry, PsfModel.residual])
+@pytest.mark.parametrize(
+    ("moved", "message"),
+    [
+        (lambda place: place[:, ::-1], "x and y exchanged"),
+        (lambda place: place + np.array([2.0, -3.0]), "a list of another image"),
+        (lambda place: place + 1.0, "origin=1"),
+    ],
+)
+def test_a_list_of_another_image_or_origin_is_refused_unless_it_is_accepted(
+    sky, call, moved, message
+):
+    folder, path, true = sky
+    place = np.stack([true["x"], true["y"]], axis=1)[~true["pair"]]
+    model, image = load_model(path), folder / "i.fits"
+    with pytest.raises(Error, match=message):
+        call(model, image, catalogue=moved(place))
+    call(model, image, catalogue=moved(place), accept_offset=True)
+
+
 def test_the_halo_of_a_saturated_star_that_no_list_has_is_no_light_of_its_neighbours(sky):
     folder, model, true = sky
     middle = np.array([165.0, 170.0])
@@ -543,6 +563,32 @@ def test_wings_and_sky_settle_in_two_fits(monkeypatch):
     # The sky takes a part of the wings, which one fit alone does not give back.
     assert abs(fits[0].light()[0] - light) > error
     assert 2 <= fit_count <= 3 and abs(wings.light()[0] - light) < 0.3 * error
+
+
+@pytest.mark.parametrize("ratio", [(0.64, 0.0), (0.7, -0.3), (0.5, 0.5), (-0.4, 0.0)])
+def test_wings_and_sky_settle_where_the_answer_of_the_sky_changes(monkeypatch, ratio):
+    """Turns reach the fixed point of F(x), whose slope ρ changes once x is nearer to it.
+
+    A ρ of the first turns that was kept let the following ones diverge: all fluxes were too large
+    by many of their errors.
+    """
+    stars = StarFluxes(np.array([[50.0, 50.0]]), np.array([1e4]), np.array([0.03]))
+    unit = Wings(RADIUS, np.geomspace(2e-4, 7e-5, len(RADIUS)), np.eye(len(RADIUS)), 0.03)
+    light = unit.light()[0]
+    unit = replace(unit, covariance=np.eye(len(RADIUS)) * (light / unit.light()[1]) ** 2)
+
+    def answer(*args):
+        # In units of the fixed point, with an error of 1: slope ρ₁ below the knee, ρ₂ from there.
+        distance, knee = args[5].light()[0] / light - 1.0, -0.15
+        change = ratio[1] * max(distance, knee) + ratio[0] * min(distance - knee, 0.0)
+        return replace(unit, profile=unit.profile * (1.0 + change))
+
+    monkeypatch.setattr(wings_fit, "fit_wings", answer)
+    image = np.random.default_rng(3).normal(300.0, 15.0, (100, 100))
+    sky, nothing = subtract_sky(image, np.zeros(image.shape, bool)), np.zeros(image.shape)
+    start = replace(unit, profile=0.6 * unit.profile)
+    args = image, sky, sky.noise, nothing, stars, 10, start, 0.02, np.empty((0, 3))
+    assert around_stars(*args)[2].light()[0] / light == pytest.approx(1.0, abs=0.04)
 
 
 @pytest.mark.parametrize("distance", [9, 60])
