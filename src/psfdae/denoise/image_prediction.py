@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfdae.base.errors import call, keyword
+from psfdae.base.errors import call
 from psfdae.denoise.prediction import Prediction
 from psfdae.denoise.star_model import StarModel
 from psfdae.image.camera import other_instruments
@@ -76,9 +76,7 @@ def open_for_model(model: StarModel, source: ImageInput, fixed: bool = False) ->
     if model.info.source == "stars":
         # A model of an image may have been trained without a known pixel scale, too.
         observation = observation.assume_scale()
-    advice = f" (scale assumed, {keyword('pixel_scale_arcsec')} sets it)"
-    scale_note = advice if observation.scale_assumed else ""
-    model.check_scale(observation.pixel_scale_arcsec, f"{source.path}{scale_note}")
+    model.check_scale(observation.pixel_scale_arcsec, observation.name_with_scale)
     if fixed and not (model.method.knows_field and isinstance(observation, Image)):
         raise PredictionError(
             f"{source.path}: {call('fixed=True', '--fixed-positions')} needs an image with a star "

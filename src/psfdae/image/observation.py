@@ -22,6 +22,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from psfdae.base.errors import keyword
 from psfdae.base.types import WCS, Table
 from psfdae.image.camera import CameraValue
 from psfdae.image.catalogue import Catalogue
@@ -156,6 +157,12 @@ class Observation(ABC):
     def unit(self) -> str:
         """Unit of the image's pixels from its header; "" if the header gives none."""
         return self.data.unit
+
+    @property
+    def name_with_scale(self) -> str:
+        """Name of the file for messages on its pixel scale, with a note if that is assumed."""
+        advice = f" (scale assumed, {keyword('pixel_scale_arcsec')} sets it)"
+        return f"{self.path}{advice * self.scale_assumed}"
 
     @property
     def scale_assumed(self) -> bool:

@@ -31,6 +31,9 @@ from psfdae.photometry.photon_noise import add_measured_gain
 from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import robust_scatter
 
+MAX_MAGNITUDE = 50.0
+"""Magnitudes of reference stars are not known from here on."""
+
 
 class PhotometryError(Error, ValueError):
     """Options that exclude each other, or too few stars for a zero point."""
@@ -127,7 +130,7 @@ def measure_all_stars(
         advance(1, "image")
         if not isinstance(observation, Image):
             raise PhotometryError(f"{source.path}: photometry takes an image, no cube of stamps")
-        model.check_scale(observation.pixel_scale_arcsec, str(source.path))
+        model.check_scale(observation.pixel_scale_arcsec, observation.name_with_scale)
         # The image may show another part of the detector than the training.
         model, frame_notes = model.to_image_frame(observation)
         # Read the stars of the reference before the long work, in case they cannot be used.
@@ -294,7 +297,7 @@ def measure_zero_point(
     positions : ndarray, shape (n, 2)
         Pixel positions x, y of the reference stars in the image.
     magnitude : ndarray, shape (n,)
-        Their magnitudes m.
+        Their magnitudes m; NaN, or ±50 and beyond, where they are not known.
     reference : str
         Name of the star list, for messages.
 
@@ -310,7 +313,8 @@ def measure_zero_point(
     flux = np.array(stars["flux"], dtype=np.float64)
     has_flux = np.flatnonzero(np.isfinite(flux) & (flux > 0))
     star_positions = np.stack([stars["x"], stars["y"]], axis=1)[has_flux]
-    complete = np.isfinite(positions).all(axis=1) & np.isfinite(magnitude)
+    # SExtractor and DAOPHOT write ±99 for a magnitude that they could not measure.
+    complete = np.isfinite(positions).all(axis=1) & (np.abs(magnitude) < MAX_MAGNITUDE)
     # Each reference star is the nearest star of the image if that is within half a FWHM.
     distance_px, star = cKDTree(star_positions).query(positions[complete])
     is_match = distance_px < 0.5 * star_fit.model.fwhm_px()
@@ -322,8 +326,9 @@ def measure_zero_point(
             f"{reference}: {count} of its stars with a magnitude are stars of the image, 3 are "
             "needed for a zero point"
         )
+    # The median of n normal values has the standard error √(π/2n) σ.
     scatter = float(robust_scatter(zero_points[:, None])[0])
-    value, error = float(np.median(zero_points)), scatter / math.sqrt(count)
+    value, error = float(np.median(zero_points)), math.sqrt(0.5 * math.pi / count) * scatter
     note = f"zero point {value:.4f} ± {error:.4f} mag ({count} stars of {reference})"
     return value, scatter, note
 

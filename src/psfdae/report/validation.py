@@ -97,7 +97,7 @@ def _require_unseen(model: StarModel, stars: ImageStars) -> None:
     """
     info, product, path = model.info, stars.product, stars.observation.path
     # Pixels and stamps must have the size of the model's.
-    model.check_scale(stars.observation.pixel_scale_arcsec, str(path))
+    model.check_scale(stars.observation.pixel_scale_arcsec, stars.observation.name_with_scale)
     if info.stamp_px != stars.settings.framing.stamp_px:
         raise PredictionError(
             f"{path}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "

@@ -78,7 +78,7 @@ def exposure(model: Model, source: ImageInput, name: str) -> tuple[Model, str]:
     observation = open_observation(source, info.stamp_px, calibration.margin_px).assume_scale()
     if not isinstance(observation, Image):
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
-    model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
+    model.check_scale(observation.pixel_scale_arcsec, observation.name_with_scale)
     model, frame_notes = model.to_image_frame(observation)
     difference = other_instrument(model, observation)
     bright = collect(observation, calibration, settings.framing).bright

@@ -29,7 +29,7 @@ from psfdae.image.stamps import cut_image
 from psfdae.image.trails import find_saturated_cores
 from psfdae.photometry import crowded, wings_fit
 from psfdae.photometry.crowded import CrowdedPhotometry
-from psfdae.photometry.image_photometry import add_unmeasured_rows
+from psfdae.photometry.image_photometry import add_unmeasured_rows, measure_zero_point
 from psfdae.photometry.photon_noise import add_measured_gain, measure_gain
 from psfdae.photometry.wings_fit import (
     StarFluxes,
@@ -773,3 +773,31 @@ def test_a_list_is_as_accurate_as_where_its_bright_stars_are():
     assert crowded.locate_listed_stars(fit, origin, fwhm) is None
     fit.flags[9:] = 1
     assert crowded.locate_listed_stars(fit, origin, fwhm) is None
+
+
+@pytest.mark.parametrize("call", [PsfModel.photometry, PsfModel.adapt, PsfModel.predict_image])
+def test_a_pixel_scale_that_is_assumed_is_said_to_be(sky, call):
+    folder, path, true = sky
+    place, bundle = np.stack([true["x"], true["y"]], axis=1), load_model(path).bundle
+    info = bundle.info.model_copy(update={"pixel_scale_arcsec": 2.0})
+    model = PsfModel(replace(bundle, info=info))
+    # Pixels of 1 arcsec are assumed where neither WCS nor header has a scale.
+    message = r"scale assumed, pixel_scale_arcsec= sets it.*pixels of 1 arcsec"
+    with pytest.raises(Error, match=message):
+        call(model, fits.getdata(folder / "i.fits"), catalogue=place, gain=1.0)
+
+
+def test_the_zero_point_is_a_median_with_its_standard_error():
+    """Errors of 400 draws of 41 stars; a third of the reference stars have no magnitude."""
+    rng, positions = np.random.default_rng(5), np.arange(120.0).reshape(60, 2) * 10
+    stars = Table({"x": positions[:, 0], "y": positions[:, 1], "flux": np.full(60, 100.0)})
+    fit = SimpleNamespace(stars=stars, model=SimpleNamespace(fwhm_px=lambda: 3.0))
+    magnitude = np.repeat([99.0, -99.0, np.nan, 999.0, 15.0], [5, 5, 5, 4, 41])
+    pulls = []
+    for _ in range(400):
+        noisy = magnitude + rng.normal(0.0, 0.05, 60)
+        value, scatter, note = measure_zero_point(fit, positions, noisy, "r")
+        error = float(note.split("±")[1].split()[0])
+        pulls.append((value - 20.0) / error)
+        assert "(41 stars of r)" in note and 0.02 < scatter < 0.1
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.15) and abs(np.mean(pulls)) < 0.2
