@@ -145,8 +145,8 @@ def find_unlike_stars(flags: np.ndarray) -> np.ndarray:
     flags : ndarray of int, shape (n,)
         Sums of `StarFlag`.
     """
-    both = int(StarFlag.UNLIKE_TRAINING | StarFlag.OFF_CENTRE)
-    return np.asarray((flags & both) == int(StarFlag.UNLIKE_TRAINING))
+    is_unlike = (flags & int(StarFlag.UNLIKE_TRAINING)) > 0
+    return np.asarray(is_unlike & ((flags & int(StarFlag.OFF_CENTRE)) == 0))
 
 
 # Cutting stamps out of an image.

@@ -146,7 +146,7 @@ def measure_all_stars(
         # All stars of the image, and the zero point by those that the reference has.
         observation = add_measured_gain(model, observation)
         star_fit = measure_stars(model, observation, source.given_threshold)
-    # Reject a list of another image, whose fluxes would be those of the sky and of other stars.
+    # Reject a list of another image: its fluxes would belong to the sky and to other stars.
     offset = offsets_from_list(star_fit, observation)
     list_note = list_offset(observation.catalogue, offset, source.accept_offset)
     zero_point_note = None
@@ -217,7 +217,7 @@ def offsets_from_list(star_fit: CrowdedPhotometry, observation: Image) -> np.nda
     -------
     ndarray, shape (n, 2)
         Along x and y in px; NaN for stars that are faint or without a flux, whose positions noise
-        decides. Without rows where the stars are not those of a list.
+        decides. No rows if there is no list, or if the stars were detected.
     """
     # Rows of stars that were detected have no listed position.
     stars = star_fit.stars
