@@ -190,7 +190,8 @@ def draw_method(fit_axes, star_axes, points, look):
     for name, rows in marked.items():
         fit_axes.plot(points["fit_cpu_s"][rows], points["over_least"][rows], **MARKS[name][1])
     for row in lengths[lengths["point"].str.startswith("epochs")].itertuples():
-        label_point(fit_axes, row.fit_cpu_s, row.over_least, row.point.removeprefix("epochs"), 6)
+        epochs = row.point.removeprefix("epochs")
+        label_point(fit_axes, row.fit_cpu_s, row.over_least, epochs, 6, color=look.color)
 
 
 def inference(table):
