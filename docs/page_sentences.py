@@ -290,15 +290,15 @@ def results():
     networks = tables.read_record("tables/posterior_network.csv").query("point == 'configured'")
     networks = networks.set_index(["method", "dataset"])
     for name, words in (
-        ("posterior_network", "The network is trained in {fit:.0f} s to "),
-        ("posterior_network_refined", "Refined wavefronts take {fit:.0f} s and reach "),
-        ("wavefront", "The optics alone need {fit:.0f} s and reach "),
+        ("posterior_network", "The network takes {fit:.0f} s and reaches "),
+        ("posterior_network_refined", "it takes {fit:.0f} s and reaches "),
+        ("wavefront", "The optics alone take {fit:.0f} s and reach "),
     ):
         near, far = (networks.loc[name, dataset] for dataset in datasets)
         yield words.format(fit=near.fit_cpu_s)
         yield f"{near.over_least:.2f} times the bound in dataset 3 and "
         yield f"{far.over_least:.2f} times in dataset 5, in "
-        yield f"{1e3 / near.stars_per_s:.2g} and {1e3 / far.stars_per_s:.2g} ms a star"
+        yield f"{1e3 / near.stars_per_s:.3g} and {1e3 / far.stars_per_s:.3g} ms a star"
     stress = tables.read_record("tables/stability.csv")
     assert (stress.verdict == "pass").all()
     yield f"Each of the {len(stress)} rows"

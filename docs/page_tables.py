@@ -244,22 +244,8 @@ def alignment_correlations() -> pd.DataFrame:
 # Run time
 
 
-def costs() -> pd.DataFrame:
-    """CPU time of the fit of every method, and its error over the posterior mean."""
-    table = read_record("tables/benchmark_costs.csv").sort_values(["dataset", "fit_cpu_s"])
-    table = table.assign(label=label_methods(table.method))
-    return formatted(
-        table.query("point == 'configured'"),
-        dataset="{dataset}",
-        method="{label}",
-        **{"fit, s": "{fit_cpu_s:.1f}"},
-        stars_per_second="{stars_per_s:.0f}",
-        MSE_over_the_bound="{over_least:.2f}",
-    )
-
-
-def posterior_networks() -> pd.DataFrame:
-    """CPU time and error of networks on simulated stars, beside other methods as configured."""
+def method_costs() -> pd.DataFrame:
+    """CPU time and error of all methods as configured, and of shorter trainings of the network."""
     table = read_record("tables/posterior_network.csv").sort_values(["dataset", "fit_cpu_s"])
     table = table[(table.point == "configured") | table.method.str.startswith("posterior_network")]
     epochs = table.point.str.extract(r"epochs(\d+)", expand=False)
@@ -607,7 +593,7 @@ TABLES: dict[str, Callable[[], pd.DataFrame]] = {
         for function in (
             *(paper_preset, all_errors, optics, denoisers, seed_scatters),
             *(alignment_errors, alignment_correlations),
-            *(costs, posterior_networks, trainings, image_costs, propagators, stages, flux_errors),
+            *(method_costs, trainings, image_costs, propagators, stages, flux_errors),
             *(own_stars, real_image, real_image_ratios, poppy_stars, coverage, outliers),
             *(night_cost, calibration, paper_columns, pixel_scales, held_out_fields, paper_rows),
             *(posterior_means, efficiencies, image_options),
