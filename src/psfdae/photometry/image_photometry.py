@@ -32,7 +32,7 @@ from psfdae.psf.interface import FieldPsfs
 from psfdae.stars.moments import robust_scatter
 
 MAX_MAGNITUDE = 50.0
-"""Magnitudes of reference stars are not known from here on."""
+"""A larger magnitude of a reference star, of either sign, means that it is not known."""
 
 
 class PhotometryError(Error, ValueError):
@@ -297,7 +297,7 @@ def measure_zero_point(
     positions : ndarray, shape (n, 2)
         Pixel positions x, y of the reference stars in the image.
     magnitude : ndarray, shape (n,)
-        Their magnitudes m; NaN, or ±50 and beyond, where they are not known.
+        Their magnitudes m; NaN, or beyond ± `MAX_MAGNITUDE`, where they are not known.
     reference : str
         Name of the star list, for messages.
 
