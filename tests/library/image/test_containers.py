@@ -186,7 +186,7 @@ def test_an_image_of_the_pages_table_gives_what_it_says(
         words += [*WORDS, "--method", "field", "--out", "m", "--overwrite"]
         with few_draws():
             process = psfdae("train", "image.fits", *words)
-        assert process.exit_code == (2 if "refused" in row[1] else 0), process.output
+        assert process.exit_code == (2 if "rejected" in row[1] else 0), process.output
         output += process.output
     assert all(words_of_page in output for words_of_page in re.findall("`([^`]+)`[.,]", row[1])), (
         output
