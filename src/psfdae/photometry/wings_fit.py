@@ -433,6 +433,11 @@ def around_stars(
             )
         if previous is not None and unknown_light < tolerance * light_sigma:
             break
+    else:
+        # Wings that have not settled are known to the last change only.
+        assert wings is not None  # a turn without wings ends the loop
+        scale = 1.0 + (unknown_light / light_sigma) ** 2
+        wings = replace(wings, covariance=scale * wings.covariance)
     del residual  # of a large image, each map takes much memory
     wing_light = draw_wings(image.shape, stars, wings)
     without_stars -= wing_light

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from dataclasses import replace
+from itertools import cycle
 from types import SimpleNamespace
 
 import numpy as np
@@ -589,6 +590,28 @@ def test_wings_and_sky_settle_where_the_answer_of_the_sky_changes(monkeypatch, r
     start = replace(unit, profile=0.6 * unit.profile)
     args = image, sky, sky.noise, nothing, stars, 10, start, 0.02, np.empty((0, 3))
     assert around_stars(*args)[2].light()[0] / light == pytest.approx(1.0, abs=0.04)
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.5])
+def test_wings_that_do_not_settle_have_the_error_of_their_changes(monkeypatch, spread):
+    """Answers alternate between two values, whatever the wings that were subtracted."""
+    stars = StarFluxes(np.array([[50.0, 50.0]]), np.array([1e4]), np.array([0.03]))
+    unit = Wings(RADIUS, np.geomspace(2e-4, 7e-5, len(RADIUS)), 1e-14 * np.eye(len(RADIUS)), 0.03)
+    light, error = unit.light()
+    assert error < 0.01 * spread * light
+    factors = cycle([1.0 + spread, 1.0 - spread])
+    answers = []
+
+    def answer(*args):
+        answers.append(next(factors))
+        return replace(unit, profile=answers[-1] * unit.profile)
+
+    monkeypatch.setattr(wings_fit, "fit_wings", answer)
+    image = np.random.default_rng(3).normal(300.0, 15.0, (100, 100))
+    sky, nothing = subtract_sky(image, np.zeros(image.shape, bool)), np.zeros(image.shape)
+    args = image, sky, sky.noise, nothing, stars, 10, unit, 0.02, np.empty((0, 3))
+    _, wing_error = around_stars(*args)[2].light()
+    assert len(answers) == 8 and spread * light < wing_error < 4.0 * spread * light
 
 
 @pytest.mark.parametrize("distance", [9, 60])
