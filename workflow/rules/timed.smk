@@ -63,7 +63,7 @@ rule benchmark_costs:
 use rule benchmark_costs as posterior_network_costs with:
     input:
         rules.benchmark_costs.output,
-        lambda w: timings.network_cost_tables(RUN),
+        lambda w: timings.cost_tables_on_request(RUN),
     output:
         f"{RESULTS}/tables/posterior_network.csv",
     log:

@@ -147,7 +147,7 @@ def measure_all_stars(
         observation = add_measured_gain(model, observation)
         star_fit = measure_stars(model, observation, source.given_threshold)
     # Reject a list of another image: its fluxes would belong to the sky and to other stars.
-    offset = offsets_from_list(star_fit, observation)
+    offset = measure_list_offsets(star_fit, observation)
     list_note = list_offset(observation.catalogue, offset, source.accept_offset)
     zero_point_note = None
     if magnitudes is not None:
@@ -203,7 +203,7 @@ def measure_stars(
     return star_fit
 
 
-def offsets_from_list(star_fit: CrowdedPhotometry, observation: Image) -> np.ndarray:
+def measure_list_offsets(star_fit: CrowdedPhotometry, observation: Image) -> np.ndarray:
     """Return the offsets of stars from the positions of their list.
 
     Parameters

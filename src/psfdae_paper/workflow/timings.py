@@ -47,7 +47,7 @@ def cost_tables(run: Run) -> list[str]:
     ]
 
 
-def network_cost_tables(run: Run) -> list[str]:
+def cost_tables_on_request(run: Run) -> list[str]:
     """Return the tables of methods that are timed on request, such as networks."""
     return [
         path

@@ -799,7 +799,7 @@ def test_a_list_is_as_accurate_as_where_its_bright_stars_are():
 
 
 @pytest.mark.parametrize("call", [PsfModel.photometry, PsfModel.adapt, PsfModel.predict_image])
-def test_a_pixel_scale_that_is_assumed_is_said_to_be(sky, call):
+def test_a_message_on_the_pixel_scale_names_it_as_assumed(sky, call):
     folder, path, true = sky
     place, bundle = np.stack([true["x"], true["y"]], axis=1), load_model(path).bundle
     info = bundle.info.model_copy(update={"pixel_scale_arcsec": 2.0})

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 import figures
+from costs import load_points
 from psfdae.base.figures import apply_style
 from psfdae_paper.alignment.telescope import DEGREES_OF_FREEDOM
 from psfdae_paper.evaluation.alignment_figures import draw_costs, draw_twins
@@ -130,6 +131,18 @@ def test_costs_say_on_which_noise_levels_they_rest(record_table):
     for dataset, rows in table.groupby("dataset"):
         levels = str(rows.noise_levels.iloc[0]).replace(" ", ", ")
         assert f"{dataset}: {rows.stars.iloc[0]} stars, λ = {levels}" in titles
+
+
+def test_costs_of_datasets_with_other_methods_have_all_points_but_trials(record_table):
+    table = record_table("posterior_network")
+    panels = apply_style(figures.costs)(table).axes[::2]
+    trials = load_points().trials
+    is_trial = np.array([r.point in trials.get(r.method, {}) for r in table.itertuples()])
+    assert table.dataset.nunique() == len(panels) == 3 and is_trial.any()
+    for axes, (dataset, rows) in zip(panels, table.groupby("dataset"), strict=True):
+        drawn_s = np.concatenate([points[:, 0] for points, _ in line_points(axes)])
+        is_drawn = np.isin(rows.fit_cpu_s, drawn_s)
+        np.testing.assert_array_equal(is_drawn, ~is_trial[rows.index], err_msg=dataset)
 
 
 @pytest.mark.parametrize(("tight", "expected"), [("yes", 0), ("no", 1)])
